@@ -25,7 +25,7 @@ from magtwin.sim.engines.newton import Newton
 from magtwin.sim.motion.follow import follow
 from magtwin.spec.obstacles import Obstacles
 from magtwin.twin import open_twin, scene_from_toml
-from magtwin.urdf import convert_urdf
+from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.options import Options
 from magtwin.usd.lab.obstacles import read_obstacles
 

@@ -45,7 +45,6 @@ def convert(job: dict, row: dict):
         "notes": list(report.notes),
         "losses": list(report.losses),
         "repairs": {line.kind: line.count for line in report.repairs},
-        "lint": len(report.lint),
         "meshes_absent": sum(line.count for line in report.repairs if line.kind == "mesh-missing"),
         "boxes": boxes(report),
         "mass_kg": report.mass_out_kg,

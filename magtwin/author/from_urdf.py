@@ -17,17 +17,12 @@ from magtwin.urdf.report import ConversionReport
 if TYPE_CHECKING:
     from magtwin.author.robot import RobotSettings
     from magtwin.spec.robot import RobotSpec
-    from magtwin.urdf.description.kinematics import link_poses
     from magtwin.urdf.write import write_urdf
 
-__all__ = ["DriveRule", "Options", "Robot", "RobotSettings", "from_urdf", "link_poses", "write_urdf"]
+__all__ = ["DriveRule", "Options", "Robot", "RobotSettings", "from_urdf", "write_urdf"]
 
-LATER = {
-    "RobotSettings": "magtwin.author.robot",
-    "link_poses": "magtwin.urdf.description.kinematics",
-    "write_urdf": "magtwin.urdf.write",
-}
-"""Modules of names that are imported when they are used, since a small conversion takes no longer."""
+LATER = {"RobotSettings": "magtwin.author.robot", "write_urdf": "magtwin.urdf.write"}
+"""Modules of names that are imported when they are used: what a conversion without settings does without."""
 
 
 @dataclass(frozen=True)
@@ -80,15 +75,14 @@ def from_urdf(
             folder.mkdir()
             report = convert_with_report(urdf, folder / name, options=options, thumbnail=thumbnail)
         return Robot(asset, None, report)
-    from magtwin.author.robot import RobotSettings, build_robot, read_settings
-    from magtwin.usd.robot import load_robot
-
-    given = settings if isinstance(settings, RobotSettings) else read_settings(settings)
+    equipped = import_module(LATER["RobotSettings"])
+    given = settings if isinstance(settings, equipped.RobotSettings) else equipped.read_settings(settings)
     options = dataclasses.replace(given.conversion, **choices)
     with output(out, force=force) as folder:
         folder.mkdir()
-        report = build_robot(urdf, given, folder / name, options=options, thumbnail=thumbnail)
-        spec = dataclasses.replace(load_robot(folder / name, own=True), asset=asset.resolve())
+        report = equipped.build_robot(urdf, given, folder / name, options=options, thumbnail=thumbnail)
+        spec = equipped.load_robot(folder / name, own=True)
+        spec = dataclasses.replace(spec, asset=asset.resolve())
     return Robot(asset, spec, report)
 
 

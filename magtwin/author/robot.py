@@ -19,12 +19,13 @@ from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import PlatformFieldSpec
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec
-from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec, MountSpec
+from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec
 from magtwin.urdf.convert import convert_with_report
 from magtwin.urdf.options import DEFAULTS, Options
 from magtwin.urdf.report import ConversionReport
 from magtwin.urdf.reroot import reroot
 from magtwin.usd.geometry import BASE_LINK
+from magtwin.usd.robot import load_robot as load_robot
 from magtwin.usd.robot import urdf_of
 from magtwin.usd.schema import NOUNS, prims_with
 from magtwin.usd.sensors import (
@@ -199,29 +200,28 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
     sensors: tuple[tuple[str, Any, Any, Any], ...] = (
         ("imu", settings.imu, ImuSpec(), define_imu),
         ("lidar", settings.lidar, LidarSpec(), define_lidar),
+        ("magnetometer", settings.magnetometer, MagnetometerSpec(), define_magnetometer),
     )
-    for name, given, spec, define in sensors:
+    for name, given, default, define in sensors:
         if given is None and prims_with(robot, name):
             continue
+        spec = given or default
+        if given is None and spec.link not in links and name == "magnetometer":
+            raise InputError(
+                f"[magnetometer] link: the URDF has no link {spec.link!r} and no magnetometer among "
+                "its sensors; place one with --magnetometer LINK:X,Y,Z of magtwin scene --urdf, or with link "
+                f"and p_link_sensor of [robot.magnetometer]; links: {', '.join(links)}"
+            )
         if given is None and spec.link not in links:
             base = _base(robot)
             notes.append(f"no {name} given: placed at the origin of {base.name}")
             define(stage, _free(links, base, name), replace(spec, link=base.name))
-        else:
-            path = _mount(links, name, given or spec)
-            notes += _replace_sensors(robot, name, path)
-            define(stage, path, replace(given or spec, link=path.GetParentPath().name))
-    if settings.magnetometer is not None or not prims_with(robot, "magnetometer"):
-        magnetometer = settings.magnetometer or MagnetometerSpec()
-        if settings.magnetometer is None and magnetometer.link not in links:
-            raise InputError(
-                f"[magnetometer] link: the URDF has no link {magnetometer.link!r} and no magnetometer among "
-                "its sensors; place one with --magnetometer LINK:X,Y,Z of magtwin scene --urdf, or with link "
-                f"and p_link_sensor of [robot.magnetometer]; links: {', '.join(links)}"
-            )
-        path = _mount(links, "magnetometer", magnetometer)
-        notes += _replace_sensors(robot, "magnetometer", path)
-        define_magnetometer(stage, path, replace(magnetometer, link=path.GetParentPath().name))
+            continue
+        if spec.link not in links:
+            raise InputError(f"[{name}] link: the URDF has no link {spec.link!r}; {hint(spec.link, links)}")
+        path = _free(links, links[spec.link], name)
+        notes += _replace_sensors(robot, name, path)
+        define(stage, path, replace(spec, link=path.GetParentPath().name))
     return notes
 
 
@@ -280,13 +280,6 @@ def _links(robot: Usd.Prim) -> dict[str, Sdf.Path]:
 def _base(robot: Usd.Prim) -> Sdf.Path:
     """Path of the robot's first body, which the converter makes its base."""
     return next(p.GetPath() for p in robot.GetChildren() if p.HasAPI(UsdPhysics.RigidBodyAPI))
-
-
-def _mount(links: dict[str, Sdf.Path], name: str, spec: MountSpec) -> Sdf.Path:
-    """Path of a sensor on its link."""
-    if spec.link not in links:
-        raise InputError(f"[{name}] link: the URDF has no link {spec.link!r}; {hint(spec.link, links)}")
-    return _free(links, links[spec.link], name)
 
 
 def _free(links: dict[str, Sdf.Path], link: Sdf.Path, name: str) -> Sdf.Path:

@@ -171,7 +171,7 @@ def _with_copies(scene: Scene, folder: Path) -> Scene:
         if magnetometer.network is not None:
             weights = once(magnetometer.network, "weights", robot.name, _copied)
             magnetometer = replace(magnetometer, network=weights)
-        asset = once(robot.asset, "robots", robot.name, _copied_robot)
+        asset = once(robot.asset, "robots", robot.name, _copied_asset)
         if isinstance(path, Path):
             path = once(path, "paths", robot.name, _copied)
         robot = replace(robot, asset=asset, magnetometer=magnetometer)
@@ -190,17 +190,12 @@ def _copied(file: Path, folder: Path) -> Path:
     return Path(shutil.copyfile(existing(file, "file of a scene"), folder / file.name))
 
 
-def _copied_robot(asset: Path, folder: Path) -> Path:
-    """A robot's asset copied to a folder with its own name, as Isaac Sim wants it, below `folder`."""
-    return _copied_asset(asset, folder / asset.stem)
-
-
 def _copied_asset(asset: Path, folder: Path) -> Path:
-    """A USD file copied with every file that it names, its thumbnail and its URDF.
+    """A robot's asset copied below `folder`, in a folder of its name, with every file that it names.
 
-    ROS publishes the URDF. Its meshes are not copied, since the asset has them.
+    Its thumbnail and its URDF come along. ROS publishes the URDF; its meshes are not copied.
     """
-    asset = asset.resolve()
+    asset, folder = asset.resolve(), folder / asset.stem
     layers, assets, unresolved = UsdUtils.ComputeAllDependencies(str(asset))
     if unresolved:
         raise InputError(f"{asset}: names {unresolved[0]}, which is not there")

@@ -1,7 +1,8 @@
 """A scene as a TOML file: its tables, and the Scene made from them."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -160,10 +161,8 @@ def scene_from_toml(
     given = from_table(SceneFile, table, path)
     if not given.robot:
         raise InputError(f"{path}: has no robot; add a [robot] table")
-    try:
+    with _at(path, "name"):
         check_name(given.name)
-    except InputError as error:
-        raise refused_at(path, "name", str(error)) from error
     layer = Path(map_layer).resolve() if map_layer is not None else given.map
     if layer is not None:
         layer = existing_file(layer, "map layer", "USD")
@@ -179,10 +178,8 @@ def scene_from_toml(
             f'{path}: names no map; add map = "FILE.usdc" to it, or give `map_layer=FILE.usdc`, or add an '
             f"[earth] table (latitude_deg, longitude_deg, height_m, date){more}, from which it is surveyed"
         )
-    try:
+    with _about(f"{path}:"):
         check_names(sources, pieces)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     standing = obstacles_in(lab, pieces)
     robots: list[PlacedRobot] = []
     for number, (robot_table, keys) in enumerate(zip(given.robot, table["robot"], strict=True)):
@@ -192,23 +189,16 @@ def scene_from_toml(
         if layer is None and (given.survey is None or given.survey.height_m is None):
             check_above_floor(made, where)
         drives = _path(robot_table.path, Path(path).parent, where)
-        start, of_robot = robot_table.start, True
-        if start is None:
-            of_robot = not (alone or (not robots and "start" in table))
-            start = ZERO3 if of_robot else given.start
-            if of_robot and drives not in ("", "random"):  # so that robots do not start inside each other
-                way = path_in(Room(lab.floor_m, made.footprint_radius_m, standing), drives)
-                start = float(way.p_xy[0, 0]), float(way.p_xy[0, 1]), float(way.heading(0.0))
+        of_robot = robot_table.start is not None or not (alone or (number == 0 and "start" in table))
+        start = robot_table.start or (ZERO3 if of_robot else given.start)
+        if robot_table.start is None and of_robot and drives not in ("", "random"):
+            way = path_in(Room(lab.floor_m, made.footprint_radius_m, standing), drives)  # not in each other
+            start = float(way.p_xy[0, 0]), float(way.p_xy[0, 1]), float(way.heading(0.0))
         robots.append(PlacedRobot(robot=made, start=start, path=drives))
-        try:
+        with _at(path, "start", **({"section": "robot", "number": number} if of_robot else {})):
             check_start(robots[-1], lab, standing)
-        except InputError as error:
-            section = {"section": "robot", "number": number} if of_robot else {}
-            raise refused_at(path, "start", str(error), **section) from error  # type: ignore[arg-type]
-    try:
+    with _about(f"{path}: [earth]"):
         earth = checked(EarthFieldSpec(**vars(given.earth))) if given.earth else None
-    except InputError as error:
-        raise InputError(f"{path}: [earth] {error}") from error
     scene = Scene(
         name=given.name,
         map_layer=Path("surveyed") if layer is None else layer,
@@ -222,17 +212,31 @@ def scene_from_toml(
         path=robots[0].path,
         others=tuple(robots[1:]),
     )
-    try:
+    with _about(f"{path}:"):
         check_things(scene)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     if layer is None and survey_of is not None:
-        try:
+        with _about(f"{path}: cannot be surveyed:"):
             surveyed = survey_of(scene, given.survey or SurveySpec(), given.seed, standing)
-        except InputError as error:
-            raise InputError(f"{path}: cannot be surveyed: {error}") from error
         scene = replace(scene, map_layer=surveyed, map_sha256=layer_sha256(surveyed))
     return scene
+
+
+@contextmanager
+def _about(start: str) -> Iterator[None]:
+    """Errors inside begin with what they are about."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{start} {error}") from error
+
+
+@contextmanager
+def _at(path: str | os.PathLike[str], key: str, **table: Any) -> Iterator[None]:
+    """Errors inside have the line of a key of the TOML."""
+    try:
+        yield
+    except InputError as error:
+        raise refused_at(path, key, str(error), **table) from error
 
 
 def check_above_floor(robot: RobotSpec, where: str) -> None:
@@ -292,10 +296,8 @@ def _robot(
         folder = Path(workshop) / table.name if named else Path(workshop)
         folder.mkdir(parents=True, exist_ok=True)
         asset = folder / f"{table.urdf.name.split('.')[0]}.usda"
-        try:
+        with _about(where):
             build_robot(table.urdf, settings, asset)
-        except InputError as error:
-            raise InputError(f"{where} {error}") from error
         robot = load_robot(asset, own=True)
     return replace(robot, name=table.name) if named else robot
 
@@ -332,10 +334,8 @@ def _path(path: str, folder: Path, where: str) -> str | Path:
         return path
     file = (folder / path).resolve()
     named = not Path(path).suffix and not file.exists()
-    try:
+    with _about(f"{where} path:"):
         resolve_path(path if named else file)
-    except InputError as error:
-        raise InputError(f"{where} path: {error}") from error
     return path if named else file
 
 

@@ -12,7 +12,6 @@ from magtwin.cli.terminal import Done
 
 ADDS = {
     "cluster": "work on a dask cluster (magtwin bench --dask, magtwin sweep --dask)",
-    "decomposition": "convex decomposition of collision meshes (magtwin robot --collision decomposition)",
     "gym": "a Gymnasium environment (magtwin.gym)",
     "onnx": "networks as ONNX (magtwin network export, magtwin export)",
     "pandas": "runs as pandas tables (Run.to_pandas)",

@@ -56,8 +56,8 @@ def scene_with_robot(
     """
     from magtwin.author.robot import RobotSettings, build_robot
     from magtwin.author.scene_file import check_above_floor
-    from magtwin.urdf.lint import HUGE_M
     from magtwin.urdf.options import Options
+    from magtwin.urdf.report import HUGE_M
     from magtwin.usd.robot import load_robot
 
     file = expected(FilePath(robot), "robot")

@@ -5,10 +5,10 @@ import shutil
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics, UsdUtils, Vt
 
@@ -17,20 +17,18 @@ from magtwin.files.file import sha256
 from magtwin.files.outputs import check_free, output, transaction
 from magtwin.spec.drive import DriveSpec
 from magtwin.urdf.description.description import Description, origin_of, read_description
+from magtwin.urdf.description.extensions import MODULES
 from magtwin.urdf.description.tag import Tags
 from magtwin.urdf.layout import GEOMETRIES, PAYLOADS, check_payloads, write_layers
-from magtwin.urdf.lint import lint
 from magtwin.urdf.material import LOOKS
 from magtwin.urdf.meshes.mesh_layer import MeshLayer, free_name, gather
 from magtwin.urdf.meshes.texture import TEXTURES
 from magtwin.urdf.options import DEFAULTS, Options
 from magtwin.urdf.physics.articulation import define_articulation, filter_overlaps
-from magtwin.urdf.physics.control import define_differential, read_base, read_commands
+from magtwin.urdf.physics.control import read_base, read_commands
 from magtwin.urdf.physics.drive import NO_WHEELS, Wheels, check_rules
 from magtwin.urdf.physics.gazebo import (
     Surface,
-    define_springs,
-    define_weightless,
     read_surfaces,
     self_collides,
 )
@@ -38,16 +36,14 @@ from magtwin.urdf.physics.joint import define_fixed_joint, define_joint, define_
 from magtwin.urdf.physics.link import SITE_API, Rider, define_body, is_marker
 from magtwin.urdf.physics.mechanism import Mechanism, read_mechanism
 from magtwin.urdf.physics.merge import WORLD, Place, carried, place_links, riders
-from magtwin.urdf.physics.mobile_base import MobileBase, drive_spec
-from magtwin.urdf.physics.plugin import leave_out
+from magtwin.urdf.physics.mobile_base import MobileBase, drive_spec, leave_out
 from magtwin.urdf.physics.wheel import find_base, fit_wheels, grip, not_on, wheel_radius
 from magtwin.urdf.placeholder import replace_failed
 from magtwin.urdf.report import ConversionReport, Ledger, make_report
-from magtwin.urdf.sensor import define_sensors
 from magtwin.urdf.shape import COLLISIONS, VISUALS, define_collider, define_no_contact, define_visual, pose_of
 from magtwin.urdf.simready import check_metadata, metadata
 from magtwin.urdf.source.source import read_source
-from magtwin.usd.attributes import read_pose, write_pose
+from magtwin.usd.attributes import write_pose
 from magtwin.usd.layers import describe_stage
 
 JOINTS = "joints"
@@ -112,7 +108,7 @@ def convert_with_report(
     )
     description = read_description(source)
     textures = f"{out.stem}_textures" if options.single_file else f"{PAYLOADS}/{TEXTURES}"
-    meshes = gather(description, options, f"./{textures}")
+    meshes = gather(description, f"./{textures}")
     description = replace_failed(description, meshes)
     check_free(out, force=force)
     write = _write_single if options.single_file else _write_payloads
@@ -182,21 +178,12 @@ class _Author:
         for note in self.finish(robot) if self.finish else ():
             description.note(note)
         checksum = sha256(description.path)
-        report = make_report(
-            description,
-            self.meshes,
-            stage,
-            self.ledger,
-            name=self.out.name,
-            sha256=checksum,
-            poses=self._poses(stage),
-            lint=lint(description, mass=options.mass, vertices=self.meshes.vertices),
-        )
+        report = make_report(description, stage, self.ledger, name=self.out.name, sha256=checksum)
         description.repairs.check(report.source, strict=options.strict)
         notes = Vt.StringArray(description.repairs.notes)
         stage.GetRootLayer().customLayerData = {
             **stage.GetRootLayer().customLayerData,
-            **metadata(stage, description, report, options.metadata),
+            **metadata(stage, report, options.metadata),
             "magtwin": {
                 "source": description.path.name,
                 "sourceSha256": checksum,
@@ -204,17 +191,6 @@ class _Author:
             },
         }
         return stage, report
-
-    def _poses(self, stage: Usd.Stage) -> dict[str, NDArray]:
-        """T_root_link of each link as authored, (4, 4); `finish` may have raised the whole robot."""
-        poses = read_mechanism(self.description, self.options).poses()
-        first = next((n for n, (became, _) in self.ledger.bodies.items() if became == "body"), None)
-        if first is not None:
-            place, _ = read_pose(stage.GetPrimAtPath(self.ledger.bodies[first][1]))
-            shift = np.eye(4)
-            shift[:3, 3] = place - poses[first][:3, 3]
-            poses = {name: shift @ pose for name, pose in poses.items()}
-        return poses
 
     def _robot(self, stage: Usd.Stage, layer: str) -> Usd.Prim:
         """The robot's prim with everything below it."""
@@ -234,9 +210,7 @@ class _Author:
             driven = base.wheels
             surfaces = grip(mechanism, driven, surfaces)
             commands = not_on(driven, commands)
-        places = place_links(
-            mechanism, merge=self.options.merge_fixed, filled=self.options.density is not None
-        )
+        places = place_links(mechanism, merge=self.options.merge_fixed)
         fixed = self.options.fix_base or (
             base is None and self.options.profile == "general" and mechanism.in_world(_base(places))
         )
@@ -254,16 +228,13 @@ class _Author:
             for part, pose in carried_links:
                 link, surface = description.links[part], surfaces.get(part, Surface())
                 rider = Rider(link, pose)
-                for i, visual in enumerate(carried(link.visuals, pose, part, name)):
-                    made = define_visual(body, visual, description, self.meshes, layer)
-                    ledger.shapes[part, "visual", i] = [prim.GetPath() for prim in made]
-                    rider.visuals.extend(made)
-                for i, collision in enumerate(carried(link.collisions, pose, part, name)):
-                    made = define_collider(body, collision, surface, self.meshes, layer)
-                    ledger.shapes[part, "collision", i] = [prim.GetPath() for prim in made]
-                    rider.colliders.extend(made)
+                for visual in carried(link.visuals, pose, part, name):
+                    rider.visuals.append(define_visual(body, visual, description, self.meshes, layer))
+                    ledger.visuals.add(rider.visuals[-1].GetPath())
+                for collision in carried(link.collisions, pose, part, name):
+                    rider.colliders.append(define_collider(body, collision, surface, self.meshes, layer))
                 parts.append(rider)
-            define_body(body, parts, description, options.density)
+            define_body(body, parts, description)
             colliders[name] = [collider for part in parts for collider in part.colliders]
             if not colliders[name]:
                 define_no_contact(body, surfaces.get(name, Surface()), self.meshes)
@@ -374,14 +345,14 @@ class _Author:
         def joint_of(name: str) -> Usd.Prim | None:
             return stage.GetPrimAtPath(ledger.joints[name]) if name in ledger.joints else None
 
-        define_springs(tags, joint_of, options)
-        define_weightless(tags, link_of)
         wheeled = not options.fix_base and (drive is not None or options.profile == "diff-drive")
         kind = "Wheeled" if wheeled else "Manipulator" if held else "Default"  # of Isaac Sim's list
         robot.CreateAttribute("isaac:robotType", Sdf.ValueTypeNames.Token, custom=False).Set(kind)
         if drive is not None:
-            define_differential(robot, drive, {name: path.name for name, path in ledger.joints.items()})
-        define_sensors(tags, robot, link_of)
+            names = {name: path.name for name, path in ledger.joints.items()}
+            import_module(MODULES["sensor"]).define_differential(robot, drive, names)
+        if tags.have("sensor"):
+            import_module(MODULES["sensor"]).define_sensors(tags, robot, link_of)
         ledger.unknown_tags = tags.keep(
             lambda name: link_of(name) if name in ledger.bodies else joint_of(name) or robot
         )

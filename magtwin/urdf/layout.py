@@ -26,7 +26,6 @@ from magtwin.files.outputs import check_free
 from magtwin.urdf.material import LOOKS
 from magtwin.urdf.shape import COLLISIONS, VISUALS
 from magtwin.usd.layers import open_layer
-from magtwin.usd.robot import conversion_data
 from magtwin.usd.schema.versions import creator
 
 PAYLOADS = "payloads"
@@ -101,8 +100,8 @@ def check_payloads(out: Path, *, force: bool) -> Path:
     folder = out.parent / PAYLOADS
     if folder.exists() and force:
         base = folder / FILES["base"]
-        layer = open_layer(base) if base.is_file() else None
-        owner = conversion_data(layer, base).get("interface", "") if layer else ""
+        data = open_layer(base).customLayerData.get("magtwin") if base.is_file() else None
+        owner = data.get("interface") if isinstance(data, dict) else None
         if owner != out.name:
             whose = f"is of {owner}" if owner else "was not made by a conversion"
             raise InputError(f"{folder}: {whose}; give each robot its own folder")

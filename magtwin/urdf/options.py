@@ -8,7 +8,6 @@ from typing import Literal, get_args
 
 from magtwin.errors import InputError
 
-Collision = Literal["hull", "decomposition", "mesh"]
 Profile = Literal["general", "diff-drive"]
 _Kind = Literal["velocity", "position", "none"]
 
@@ -33,16 +32,16 @@ class DriveRule:
     """Maximum torque or force [N m or N]. Default: the joint's effort."""
 
     def __post_init__(self) -> None:
-        wanted = {"velocity": "damping", "position": "stiffness"}.get(self.type)
+        used = {"velocity": ("damping",), "position": ("stiffness", "damping")}.get(self.type, ())
         for name, figure in (("stiffness", self.stiffness), ("damping", self.damping)):
             if not 0 <= figure < math.inf:
                 raise InputError(f"drive {self.joints!r}: {name} must be a number from 0 up, got {figure!r}")
-            if name == wanted and figure == 0:
-                raise InputError(
-                    f"drive {self.joints!r}: without {name} it cannot hold a {self.type}; give {name}="
-                )
-            if figure and (self.type == "none" or (self.type == "velocity" and name == "stiffness")):
+            if figure and name not in used:
                 raise InputError(f"drive {self.joints!r}: type {self.type} has no {name}, got {figure:g}")
+        if used and not getattr(self, used[0]):
+            raise InputError(
+                f"drive {self.joints!r}: without {used[0]} it cannot hold a {self.type}; give it"
+            )
         if self.max_force is not None and not 0 < self.max_force < math.inf:
             raise InputError(f"drive {self.joints!r}: max_force must be above 0, got {self.max_force!r}")
 
@@ -78,13 +77,6 @@ class Options:
     arguments: Mapping[str, str] = field(default_factory=dict)
     """Arguments of a xacro."""
 
-    missing_meshes: Literal["box", "note", "refuse"] = "box"
-    """Treatment of a mesh that is missing or unreadable: a box of the link's size in its place; "note" leaves
-    out its visual or collider; "refuse" lists all of them and writes nothing."""
-
-    collision: Collision = "hull"
-    """Mesh colliders: the convex hull, a convex decomposition (extra `decomposition`), or the mesh itself."""
-
     fix_base: bool = False
     """Whether the base is fixed to the world."""
 
@@ -100,9 +92,6 @@ class Options:
     controllers: Path | None = None
     """YAML with the settings of the robot's controllers (ros_control, ros2_control), for its drive."""
 
-    density: float | None = None
-    """Density of links without inertia [kg/m3]; None leaves them without."""
-
     single_file: bool = False
     """Whether to write one root layer and the meshes, instead of Isaac Sim's layers."""
 
@@ -113,17 +102,8 @@ class Options:
     """Whether to skip files and packages that a xacro includes, if they are missing and none of their macros
     is called."""
 
-    mass: float | None = None
-    """Mass on the data sheet, to check the robot's [kg]."""
-
     metadata: Mapping[str, str] = field(default_factory=dict)
-    """Metadata of the asset (author, asset_license, category, ...); overrides that of its package."""
-
-    def __post_init__(self) -> None:
-        for name in ("density", "mass"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise InputError(f"{name} must be above 0, got {value!r}")
+    """Metadata of the asset: author, asset_license, category and others."""
 
 
 DEFAULTS = Options()

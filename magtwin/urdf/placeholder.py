@@ -1,5 +1,6 @@
 """Placeholder: a box in the place of a mesh that is missing or unreadable, so that its link keeps a shape."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
@@ -7,15 +8,14 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Geometry, Link, Shape
 from magtwin.urdf.meshes.mesh import bounds
 from magtwin.urdf.meshes.mesh_layer import MeshLayer
 from magtwin.urdf.source.package import MissingFileError
 
-WATER = 1000.0
-"""Density that gives the size of a link with mass alone [kg/m3]."""
+FOLDERS = re.compile(r"(?<!\S)/[^:]*/")
+"""Folders of an absolute path, which a note leaves out: they differ between machines."""
 
 EDGE_M = 0.05
 """Edge of the box of a link of which nothing is known [m]."""
@@ -25,33 +25,22 @@ THINNEST_M = 0.001
 
 
 def replace_failed(description: Description, meshes: MeshLayer) -> Description:
-    """Replace every shape whose mesh failed, as `Options.missing_meshes` wants.
+    """Replace every shape whose mesh failed by a box.
 
-    The box of a link is that around its other shapes; else that of its mass and inertia; else a cube of its
-    mass at the density of water; else a cube with edges of `EDGE_M`.
+    The box of a link is that around its other shapes, or else a cube with edges of `EDGE_M`.
 
     Args:
         description: The description, which receives a repair for each shape.
         meshes: Its meshes, which receive the boxes.
-
-    Raises:
-        InputError: There are such meshes, and the options refuse them. The message lists all.
     """
-    failed, choice = meshes.failed, meshes.options.missing_meshes
-    for error in failed.values():
+    for error in meshes.failed.values():
         if isinstance(error, MissingFileError) and error.supply:
             description.repairs.supplies[error.supply] = None
-    if failed and choice == "refuse":
-        texts = "; ".join(map(str, failed.values()))
-        supplied = " ".join(description.repairs.supplies)
-        raise InputError(
-            texts + (f"; {supplied} would supply them" if supplied else ""), parameter="missing_meshes"
-        )
     links = dict(description.links)
     for name, link in description.links.items():
         shapes = {role: tuple(_kept(description, meshes, link, role)) for role in ("visual", "collision")}
         links[name] = replace(link, visuals=shapes["visual"], collisions=shapes["collision"])
-    return replace(description, links=links) if failed else description
+    return replace(description, links=links) if meshes.failed else description
 
 
 def _kept(description: Description, meshes: MeshLayer, link: Link, role: str) -> Iterator[Shape]:
@@ -62,22 +51,17 @@ def _kept(description: Description, meshes: MeshLayer, link: Link, role: str) ->
             yield shape
             continue
         error = meshes.failed[file]
-        what = f"mesh {file!r} cannot be read"
+        what = f"mesh {file!r} cannot be read ({FOLDERS.sub('', str(error))})"
         if isinstance(error, MissingFileError):
             what = f"mesh {file!r} is missing{error.near}"
-        about, start = description.mesh_element(file), f"link {link.name!r}: {role}"
-        if meshes.options.missing_meshes == "note":
-            description.note(f"{start} is left out: its {what}", lost=True)
-            yield shape  # the report lists it; no prim is made of it
-            continue
         size, T = _box_of(link, meshes)
         box = Geometry("box", size)
         if role == "visual":
             meshes.primitive(box)
         edges = " x ".join(f"{edge:.3g}" for edge in size)
-        text = f"{start} {what}: a box of {edges} m stands for it"
+        text = f"link {link.name!r}: {role} {what}: a box of {edges} m stands for it"
         kind = "mesh-missing" if isinstance(error, MissingFileError) else "mesh-unreadable"
-        description.repair(kind, text, about)
+        description.repair(kind, text, description.mesh_element(file))
         yield replace(shape, geometry=box, origin=T)
 
 
@@ -89,15 +73,6 @@ def _box_of(link: Link, meshes: MeshLayer) -> tuple[NDArray[np.float64], NDArray
     if known:
         low, high = bounds(np.vstack(known))
         size, T[:3, 3] = high - low, (low + high) / 2
-    elif link.inertial is not None and link.inertial.mass:
-        mass, T = link.inertial.mass, origin_of(link.inertial).copy()
-        size = np.full(3, (mass / WATER) ** (1 / 3))
-        if link.inertial.inertia is not None:
-            moments, R = np.linalg.eigh(link.inertial.inertia)
-            squares = 6 * (moments.sum() - 2 * moments) / mass
-            if squares.min() > 0:  # a box of these edges has the same inertia: I_1 = m (b^2 + c^2) / 12
-                size = np.sqrt(squares)
-                T[:3, :3] = T[:3, :3] @ R * np.sign(np.linalg.det(R))
     return np.maximum(np.round(size, 6), THINNEST_M), T
 
 

@@ -27,7 +27,6 @@ FAULTS: Mapping[str, tuple[str, str]] = {
         "mass without inertia, or with one of zeros",
         "that of the link's shape filled evenly with its mass, else of a ball of water",
     ),
-    "inertia-asymmetric": ("inertia with unequal iyx, izx or izy", "mean of the two"),
     "inertia-unreadable": ("inertia with something that is no number", "counts as missing"),
     "mass-invalid": ("mass of 0, below 0 or without a number", "the <inertial> counts as none"),
     "mimic-leader": (
@@ -59,7 +58,7 @@ FAULTS: Mapping[str, tuple[str, str]] = {
     "shape-missing": ("visual or collision without a shape that is known", "left out"),
     "shape-empty": ("shape of size 0", "left out"),
     "material-twice": ("material defined twice", "the first definition is used"),
-    "name-twice": ("link or joint name used twice", "the second is renamed, or left out if it is equal"),
+    "name-twice": ("link or joint defined twice alike", "the second is left out"),
     "name-unknown": (
         "tag about a link or joint that is missing",
         "left out; a <gazebo> is kept as text",
@@ -74,18 +73,13 @@ FAULTS: Mapping[str, tuple[str, str]] = {
     "mesh-flat": ("flat collision mesh", "thickened to a thin plate"),
     "file-name": ("package path with odd slashes, or path relative to the package", "read as meant"),
     "package-missing": ("missing package of $(find)", "files in it count as missing"),
-    "macro-unknown": ("call of an unknown macro in a .urdf", "left out, as readers of URDF do"),
     "include-renamed": (
         "missing include with the suffix .xacro or .urdf.xacro, beside a file with the other",
         "that file is included",
     ),
     "include-skipped": ("missing include of a xacro", "skipped; none of its macros is called"),
-    "declaration-late": ("blank lines before <?xml", "ignored"),
 }
 """Faults by kind: the fault, and its repair."""
-
-DECLARATION_LATE = "blank lines before the XML declaration <?xml: ignored; delete them"
-"""Text of a repair."""
 
 
 @dataclass(frozen=True)

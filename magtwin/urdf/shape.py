@@ -18,13 +18,10 @@ from magtwin.urdf.meshes.texture import Image, read_image
 from magtwin.urdf.physics.gazebo import Surface
 from magtwin.urdf.physics.inertia import quaternion
 from magtwin.urdf.source.package import MissingFileError
-from magtwin.usd.sensors import write_pose
+from magtwin.usd.attributes import write_pose
 
 VISUALS, COLLISIONS = "visuals", "collisions"
 """Xforms below a link's prim."""
-
-APPROXIMATIONS = {"hull": "convexHull", "decomposition": "convexHull", "mesh": "none"}
-"""Approximation of a mesh collider by `Options.collision`."""
 
 NO_CONTACT, NO_CONTACT_RADIUS_M = "no_contact", 0.005
 """Name and radius of the disabled collider of a body that touches nothing."""
@@ -39,7 +36,7 @@ the casters of a Fetch, which are part of its base."""
 
 def define_visual(
     body: Usd.Prim, visual: Shape, description: Description, meshes: MeshLayer, layer: str
-) -> list[Usd.Prim]:
+) -> Usd.Prim:
     """Author a URDF `<visual>`: a mesh with its look, or an Xform over one.
 
     Args:
@@ -48,9 +45,6 @@ def define_visual(
         description: The description, with the robot's materials.
         meshes: Meshes of the robot.
         layer: Asset path of the exported mesh layer.
-
-    Returns:
-        The prim; empty if its mesh is missing and the options allow that.
     """
     paint = _paint_of(visual, description, meshes.images)
     if visual.geometry.kind != "mesh":
@@ -59,46 +53,38 @@ def define_visual(
         prim.GetReferences().AddReference(layer, meshes.primitive(visual.geometry))
         _place(prim, origin_of(visual))
         wear(prim, body.GetParent(), _plain(paint, "a primitive", description), meshes)
-        return [prim]
-    entry = meshes.try_add(visual.geometry, meshes.visual)
-    if entry is None:
-        return []
+        return prim
+    entry = meshes.visual(visual.geometry)
     if not entry.textured:
         paint = _plain(paint, f"mesh {visual.geometry.filename!r} without texture coordinates", description)
-    return [_define_mesh(body, visual, entry, paint, meshes, layer)]
+    return _define_mesh(body, visual, entry, paint, meshes, layer)
 
 
 def define_collider(
     body: Usd.Prim, collision: Shape, surface: Surface, meshes: MeshLayer, layer: str
-) -> list[Usd.Prim]:
-    """Author a URDF `<collision>`: its primitive, or the solids of its mesh.
+) -> Usd.Prim:
+    """Author a URDF `<collision>`: its primitive, or the hull of its mesh.
 
-    The prims have purpose guide, so that viewers hide them by default. Arguments as for `define_visual`.
+    The prim has purpose guide, so that viewers hide it by default. Arguments as for `define_visual`.
     """
-    if collision.geometry.kind != "mesh":
-        made = [_define_primitive(body, collision)]
+    is_mesh = collision.geometry.kind == "mesh"
+    if is_mesh:
+        path = meshes.collider(collision.geometry)
+        prim = body.GetStage().DefinePrim(_path(body, COLLISIONS, collision.name or path.name), "Mesh")
+        prim.GetReferences().AddReference(layer, path)
+        _place(prim, origin_of(collision))
     else:
-        made = []
-        for path in meshes.try_add(collision.geometry, meshes.collider) or ():
-            prim = body.GetStage().DefinePrim(_path(body, COLLISIONS, collision.name or path.name), "Mesh")
-            prim.GetReferences().AddReference(layer, path)
-            _place(prim, origin_of(collision))
-            made.append(prim)
-    robot = body.GetParent()
-    for prim in made:
-        UsdGeom.Imageable(prim).CreatePurposeAttr(UsdGeom.Tokens.guide)
-        UsdPhysics.CollisionAPI.Apply(prim).CreateCollisionEnabledAttr(True)
-        if prim.IsA(UsdGeom.Mesh):
-            UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr(
-                APPROXIMATIONS[meshes.options.collision]
-            )
-            prim.AddAppliedSchema(NEWTON_MESH_API)
-            if meshes.options.collision != "mesh":
-                kind, fixed = Sdf.ValueTypeNames.Int, Sdf.VariabilityUniform
-                prim.CreateAttribute(NEWTON_HULL, kind, custom=False, variability=fixed).Set(-1)
-        wear(prim, robot, None, meshes, define_grip(robot, surface))
-        define_priority(prim, surface)
-    return made
+        prim = _define_primitive(body, collision)
+    UsdGeom.Imageable(prim).CreatePurposeAttr(UsdGeom.Tokens.guide)
+    UsdPhysics.CollisionAPI.Apply(prim).CreateCollisionEnabledAttr(True)
+    if is_mesh:
+        UsdPhysics.MeshCollisionAPI.Apply(prim).CreateApproximationAttr("convexHull")
+        prim.AddAppliedSchema(NEWTON_MESH_API)
+        kind, fixed = Sdf.ValueTypeNames.Int, Sdf.VariabilityUniform
+        prim.CreateAttribute(NEWTON_HULL, kind, custom=False, variability=fixed).Set(-1)
+    wear(prim, body.GetParent(), None, meshes, define_grip(body.GetParent(), surface))
+    define_priority(prim, surface)
+    return prim
 
 
 def define_no_contact(body: Usd.Prim, surface: Surface, meshes: MeshLayer) -> Usd.Prim:

@@ -1,17 +1,12 @@
 """SimReady: metadata of an asset for NVIDIA's SimReady Foundation (SR.001, SR.004)."""
 
-import os
 import re
 from collections.abc import Mapping
-from datetime import UTC, datetime
 
 from pxr import Gf, Usd, UsdPhysics
 
 from magtwin.errors import InputError, hint
-from magtwin.urdf.description.description import Description
 from magtwin.urdf.report import ConversionReport
-from magtwin.urdf.source.markup import read_markup
-from magtwin.urdf.source.package import MANIFEST
 
 KEY = "SimReady_Metadata"
 """Entry of the root layer's customLayerData."""
@@ -20,7 +15,7 @@ OUTSIDE = ("asset_name", "asset_type", "source_file", "usd_date_generated")
 """Entries that an older rule (SR.001) also requires at the top level."""
 
 UNKNOWN = "not stated"
-"""Default of entries that neither the user nor the package gives."""
+"""Default of entries that the user does not give."""
 
 ROBOT_QCODE = "Q11012"
 """Wikidata's item for robots."""
@@ -45,20 +40,14 @@ def check_metadata(given: Mapping[str, str]) -> None:
         raise InputError(f"metadata 'qcode' must be an item of Wikidata, such as {ROBOT_QCODE}, got {code!r}")
 
 
-def metadata(
-    stage: Usd.Stage, description: Description, report: ConversionReport, given: Mapping[str, str]
-) -> dict[str, object]:
-    """Entries of an asset's customLayerData: those given, then those of its package, then defaults.
-
-    The date is that of SOURCE_DATE_EPOCH, or unknown, so that the output is reproducible.
+def metadata(stage: Usd.Stage, report: ConversionReport, given: Mapping[str, str]) -> dict[str, object]:
+    """Entries of an asset's customLayerData: those given, else defaults.
 
     Args:
         stage: The authored stage.
-        description: The description; the `package.xml` of its package names author and licence.
         report: Size and mass.
         given: The user's entries by name, see GIVEN.
     """
-    author, licence = _package(description)
     low, high = report.box_out or ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     bodies = sum(prim.HasAPI(UsdPhysics.RigidBodyAPI) for prim in stage.Traverse())
     entries = {
@@ -66,9 +55,7 @@ def metadata(
         "asset_type": "robot",
         "category": "robot",
         "qcode": ROBOT_QCODE,
-        "author": author,
-        "asset_license": licence,
-        "usd_date_generated": _date(),
+        **dict.fromkeys(("author", "asset_license", "usd_date_generated"), UNKNOWN),
         **given,
         "source_file": report.source,
         "rigid_body_count": int(bodies),
@@ -76,26 +63,3 @@ def metadata(
         "mass": round(report.mass_out_kg, 6),
     }
     return {KEY: entries, **{name: entries[name] for name in OUTSIDE}}
-
-
-def _package(description: Description) -> tuple[str, str]:
-    """Author and licence in the manifest of the description's package."""
-    manifest = description.source.packages.home / MANIFEST
-    if not manifest.is_file():
-        return UNKNOWN, UNKNOWN
-    try:
-        root = read_markup(manifest, "package manifest").root
-    except InputError:
-        return UNKNOWN, UNKNOWN
-    names = [" ".join((e.text or "").split()) for tag in ("author", "maintainer") for e in root.findall(tag)]
-    licences = [" ".join((e.text or "").split()) for e in root.findall("license")]
-    return next(filter(None, names), UNKNOWN), ", ".join(filter(None, licences)) or UNKNOWN
-
-
-def _date() -> str:
-    """The date of SOURCE_DATE_EPOCH, YYYY-MM-DD."""
-    try:
-        seconds = int(os.environ.get("SOURCE_DATE_EPOCH", ""))
-        return datetime.fromtimestamp(seconds, UTC).date().isoformat()
-    except (ValueError, OverflowError, OSError):
-        return UNKNOWN

@@ -26,6 +26,7 @@ from magtwin.frames import matrix_from_quat
 from magtwin.report.report import Figure, Report
 from magtwin.urdf.description.model import rpy_of
 from magtwin.urdf.meshes.mesh_layer import MESH, free_name, primitive_of
+from magtwin.urdf.meshes.scan import STL
 from magtwin.urdf.physics.joint import AXIS
 from magtwin.urdf.physics.link import SITE_API
 from magtwin.urdf.physics.mechanism import displacement
@@ -347,7 +348,9 @@ class _Writer:
             if not prim.IsA(UsdGeom.Gprim) or not parts:
                 continue
             shown = UsdGeom.Imageable(prim).ComputePurpose() in SHOWN
-            roles = {"visual": shown, "collision": _collides(prim)}
+            roles = {"visual": shown, "collision": False}
+            if prim.HasAPI(UsdPhysics.CollisionAPI):
+                roles["collision"] = bool(UsdPhysics.CollisionAPI(prim).GetCollisionEnabledAttr().Get())
             primitive = self._primitive(prim, link)
             parent = prim.GetParent()  # has the name of the shape if it refers to a mesh
             named = parent if prim.GetName() == MESH and parent != link.prim else prim
@@ -384,36 +387,20 @@ class _Writer:
         if not np.allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), rtol=0, atol=1e-9):
             return None
         form = primitive_of(prim)
-        if prim.IsA(UsdGeom.Cube) or (form is not None and form.kind == "box"):
-            size = scale * (read_number(prim, "size") if form is None else form.size)
-            return T, "box", {"size": _text(_shortest(v) for v in size)}
-        if not np.allclose(scale, scale[0], rtol=1e-9):
+        if form is not None and form.kind == "box":
+            return T, "box", {"size": _text(_shortest(v) for v in scale * form.size)}
+        if form is None or not np.allclose(scale, scale[0], rtol=1e-9):
             return None
-        if form is not None:
-            names = ("radius",) if form.kind == "sphere" else ("radius", "length")
-            return T, form.kind, {name: _text([getattr(form, name) * scale[0]]) for name in names}
-        if prim.IsA(UsdGeom.Sphere):
-            return T, "sphere", {"radius": _text([read_number(prim, "radius") * scale[0]])}
-        for schema, tag in ((UsdGeom.Cylinder, "cylinder"), (UsdGeom.Capsule, "capsule")):
-            if prim.IsA(schema):
-                turn = np.eye(4)
-                axis = "XYZ".index(read_axis(prim))
-                if axis != 2:  # URDF's primitives are along z
-                    turn[:3, :3] = np.roll(np.eye(3), axis + 1, axis=0)
-                sizes = {"radius": read_number(prim, "radius"), "length": read_number(prim, "height")}
-                return T @ turn, tag, {name: _text([size * scale[0]]) for name, size in sizes.items()}
-        return None
+        if prim.IsA(UsdGeom.Cylinder) or prim.IsA(UsdGeom.Capsule):
+            axis = "XYZ".index(read_axis(prim))
+            if axis != 2:  # URDF's primitives are along z
+                T[:3, :3] = T[:3, :3] @ np.roll(np.eye(3), axis + 1, axis=0)
+        names = ("radius",) if form.kind == "sphere" else ("radius", "length")
+        return T, form.kind, {name: _text([getattr(form, name) * scale[0]]) for name in names}
 
     def _note(self, text: str) -> None:
         if text not in self.notes:
             self.notes.append(text)
-
-
-def _collides(prim: Usd.Prim) -> bool:
-    """Whether a prim is an enabled collider."""
-    return prim.HasAPI(UsdPhysics.CollisionAPI) and bool(
-        UsdPhysics.CollisionAPI(prim).GetCollisionEnabledAttr().Get()
-    )
 
 
 def _name(prim: Usd.Prim) -> str:
@@ -587,8 +574,7 @@ def _write_inertial(element: Element, prim: Usd.Prim) -> None:
 
 def _stl(triangles: Array) -> bytes:
     """Triangles (T, 3, 3) as binary STL."""
-    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-    rows = np.zeros(len(triangles), record)
+    rows = np.zeros(len(triangles), STL)
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     rows["normal"] = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)

@@ -55,10 +55,9 @@ def test_a_wrong_mount_is_refused_in_one_line(mount, message):
 
 def test_a_robot_in_millimetres_is_doubted_and_too_large_for_a_room(tmp_path):
     (tmp_path / "cart.urdf").write_text(CART.read_text().replace('"0.5 0.3 0.1"', '"500 300 100"'))
-    doubts = build_robot(
-        tmp_path / "cart.urdf", RobotSettings(magnetometer=MagnetometerSpec(link="mast")), tmp_path / "a.usda"
-    ).lint
-    assert doubts[0].startswith("the robot is 500 x 300 x 100 m large; are its meshes in mm?")
+    settings = RobotSettings(magnetometer=MagnetometerSpec(link="mast"))
+    notes = build_robot(tmp_path / "cart.urdf", settings, tmp_path / "a.usda").notes
+    assert any(note.startswith("the robot is 500 x 300 x") and "meshes in mm?" in note for note in notes)
     with pytest.raises(
         InputError, match=r"cart.urdf: the robot is 583.1 m wide, too large for a room; are its meshes in mm"
     ):

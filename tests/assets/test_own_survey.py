@@ -100,16 +100,3 @@ def test_the_page_ends_in_the_robot_that_the_urdf_describes(followed):
     assert robot.base_height_m == pytest.approx(0.07, abs=1e-4)
     assert robot.p_base_magnetometer == pytest.approx((-0.1, 0.0, 0.49))
     assert robot.footprint_radius_m == pytest.approx(np.hypot(0.18, 0.175), abs=1.1e-3)
-
-
-def test_the_summary_of_the_scene_lists_what_the_shape_told(followed, capsys):
-    main(["scene", str(followed / "mine.toml"), "--out", str(followed / "again")])
-    said = " ".join(capsys.readouterr().out.split())
-    for note in (
-        "footprint_radius_m not given: 0.252 m, from the robot's shape",
-        "drive: wheel separation 0.32 m, not given: the distance between the wheel joints",
-        "drive: wheel radius 0.07 m, not given: from the wheels' shape",
-        "the robot is raised by 0.07 m, so that its wheels stand on the floor",
-        "no imu given: placed at the origin of base_link",
-    ):
-        assert note in said

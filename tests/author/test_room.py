@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Usd
 from validators import assert_valid
 
 import magtwin
-from magtwin.author.furniture import DRAWN_A_M, drawn_magnetization
+from magtwin.author.furniture import drawn_magnetization
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.field.maps.holes import filled
@@ -22,13 +21,10 @@ from magtwin.files.file import shipped
 from magtwin.sim.survey import field_at_rest_nt
 from magtwin.spec.furniture import (
     KINDS,
-    MATERIALS,
-    STEEL,
     FurnitureSpec,
     parts_of,
 )
 from magtwin.twin import author_scene, new_scene, open_twin, scene_from_toml, simulate
-from magtwin.usd.lab.furniture import define_furniture, read_magnets
 from magtwin.usd.scene import read_scene
 
 ROOM = """
@@ -101,14 +97,6 @@ def test_a_drawn_magnetization_depends_on_seed_and_name_alone():
     assert first != drawn_magnetization("table", desk, seed=1)
 
 
-def test_drawn_magnetizations_are_of_either_sign_and_usual_size():
-    low, high = DRAWN_A_M
-    every = np.concatenate([drawn_magnetization(f"desk_{k}", parts_of("desk")) for k in range(200)])
-    assert low <= np.abs(every).min()
-    assert np.abs(every).max() <= high
-    assert 0.4 < np.mean(every > 0) < 0.6  # 1200 draws: sd 0.014
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_each_kind_of_furniture_makes_some_microtesla_beside_it_by_default(kind):
     parts = parts_of(kind)
@@ -136,30 +124,6 @@ def test_adding_a_piece_does_not_change_the_others(toml):
     assert any(after[-1].magnetization)
     toml.write_text(ROOM.replace("seed = 3", "seed = 4"))
     assert scene_from_toml(toml).furniture[0].magnetization != before[0].magnetization
-
-
-def test_a_piece_of_no_magnetization_stays_without_a_field(toml):
-    toml.write_text(ROOM.replace('kind = "shelf"', 'kind = "shelf"\nmagnetization = []'))
-    shelf = scene_from_toml(toml).furniture[0]
-    assert shelf.magnetization == ()
-
-
-@pytest.mark.parametrize("material", MATERIALS)
-@pytest.mark.parametrize("kind", ["box", "cylinder"])
-def test_a_generic_piece_survives_the_stage_and_only_steel_has_a_field(kind, material):
-    steel = MATERIALS[material] in STEEL
-    spec = FurnitureSpec(
-        name="thing",
-        kind=kind,
-        p_world=(0.5, -0.25, 0.1),
-        material=material,
-        size_m=(0.5, 0.5, 0.75),
-        magnetization=(1200.0,) if steel else (),
-    )
-    stage = Usd.Stage.CreateInMemory()
-    define_furniture(stage, (spec,))
-    assert read_magnets(stage) == ((), (spec,))
-    assert len(spec.sources()) == steel
 
 
 @pytest.mark.parametrize("material", ["steel", "wood"])
@@ -300,9 +264,7 @@ def test_the_floor_is_as_large_as_the_map_unless_the_toml_says(den, tmp_path):
     assert scene_from_toml(tmp_path / "a.toml").lab.floor_m == (5.0, 5.0)
 
 
-@pytest.mark.parametrize(
-    "name", ["room", "furniture", "magnetics", "Room", "map", "robot", "my room v1.2", "Küche 地下室", "it's"]
-)
+@pytest.mark.parametrize("name", ["furniture", "Room", "map", "Küche 地下室's v1.2"])
 def test_any_scene_name_works(toml, tmp_path, name):
     toml.write_text(ROOM.replace('"den"', f'"{name}"'))
     root = author_scene(toml, tmp_path / "s")
@@ -356,15 +318,6 @@ def test_a_room_that_does_not_fit_is_refused_by_line_with_nothing_written(toml, 
         author_scene(toml, tmp_path / "s")
     assert "\n" not in str(refused.value)
     assert not (tmp_path / "s").exists()
-
-
-def test_a_piece_of_another_file_with_a_name_that_is_taken_is_refused(toml, tmp_path):
-    crate = ROOM[ROOM.index("[[furniture]]", ROOM.index("shelf")) :].split("\n\n")[0]
-    assert "crate" in crate
-    (tmp_path / "more.toml").write_text(crate)
-    toml.write_text(ROOM + f"\n[sources]\nfile = '{tmp_path / 'more.toml'}'\n")
-    with pytest.raises(InputError, match=r"den\.toml: two pieces of furniture are called 'crate'"):
-        scene_from_toml(toml)
 
 
 def test_the_free_place_that_a_refusal_names_is_free(toml):

@@ -19,7 +19,7 @@ from magtwin.export.package import export_scene
 from magtwin.field.survey.folder import read_survey
 from magtwin.files.file import shipped
 from magtwin.spec.lab import LabSpec
-from magtwin.urdf import convert_urdf
+from magtwin.urdf.convert import convert_urdf
 from magtwin.usd.maps.layer import save_map
 
 BLENDER = os.environ.get("MAGTWIN_BLENDER", "")

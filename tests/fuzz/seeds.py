@@ -506,7 +506,6 @@ FORMATS: Mapping[str, Format] = {
     "scene-magnetics": Format("magnetics.usda", _scene, _read_scene, slow=True),
     "stl": Format("x.stl", _mesh, _MESH),
     "stl-text": Format("ascii.stl", _mesh, _MESH),
-    "ply": Format("x.ply", _mesh, _MESH),
     "glb": Format("x.glb", _mesh, _MESH),
     "gltf": Format("triangle.gltf", _mesh, _MESH),
     "dae": Format("triangle.dae", _mesh, _MESH),

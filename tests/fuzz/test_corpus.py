@@ -11,7 +11,7 @@ from magtwin.errors import InputError
 CORPUS = Path(__file__).with_name("corpus")
 
 OTHERS = {
-    **{kind: (kind,) for kind in ("dataset", "glb", "npz", "ply", "usdz", "xacro")},
+    **{kind: (kind,) for kind in ("dataset", "glb", "npz", "usdz", "xacro")},
     "usda.glb": ("usda", "robot"),
     "usda.info": ("usda", "robot"),
     "usda.magnetics": ("scene-magnetics", "usda"),
@@ -70,7 +70,7 @@ def test_every_kind_of_file_that_is_read_is_fuzzed():
     from magtwin.files.kinds import _BY_SUFFIX
     from magtwin.io.formats import FORMATS as RUNS
     from magtwin.io.info import NETWORKS
-    from magtwin.urdf.meshes.mesh import SUFFIXES
+    from magtwin.urdf.meshes.mesh import READERS
 
     written = {
         ".py",
@@ -85,5 +85,5 @@ def test_every_kind_of_file_that_is_read_is_fuzzed():
         *(".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".7z", ".rar"),
     }  # never read, or by another name
     fuzzed = {Path(chosen.file).suffix for chosen in FORMATS.values()}
-    known = {*RUNS, *NETWORKS, *_BY_SUFFIX, *SUFFIXES, ".yaml", ".mat", ".mtl"}
+    known = {*RUNS, *NETWORKS, *_BY_SUFFIX, *READERS, ".yaml", ".mat", ".mtl"}
     assert known - written <= fuzzed

@@ -3,7 +3,6 @@
 import pytest
 
 from magtwin.urdf.convert import convert_with_report
-from magtwin.urdf.options import Options
 
 
 @pytest.fixture(scope="session")
@@ -14,11 +13,11 @@ def real_robot(real_data, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def tagged_robot(real_data, tmp_path_factory):
-    """The same of its description with Gazebo's tags, without the two meshes that upstream lacks."""
+    """The same with Gazebo's tags, and boxes in the place of two meshes that upstream lacks."""
     return _converted(real_data, tmp_path_factory, "turtlebot4_gazebo_tags")
 
 
 def _converted(real_data, tmp_path_factory, name):
     path = real_data / "turtlebot4" / f"{name}.urdf"
     out = tmp_path_factory.mktemp(name) / "turtlebot4" / "turtlebot4.usda"
-    return path, out, convert_with_report(path, out, options=Options(missing_meshes="note"))
+    return path, out, convert_with_report(path, out)

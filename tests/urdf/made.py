@@ -3,6 +3,7 @@
 import textwrap
 
 import numpy as np
+import yourdfpy
 from pxr import Usd, UsdPhysics
 
 from magtwin.urdf.convert import convert_with_report
@@ -21,15 +22,20 @@ def urdf(tmp_path, body, name="arm"):
     return path
 
 
-def arm(tmp_path, joint, child="{BODY}"):
-    """Two links held by a joint called j, whose inner XML is given."""
-    kind, _, inner = joint.partition("|")
-    return urdf(
-        tmp_path,
-        f"""<link name="base_link">{{BODY}}</link>
-        <link name="hand">{child}</link>
-        <joint name="j" type="{kind}"><parent link="base_link"/><child link="hand"/>{inner}</joint>""",
-    )
+def link(name, content="{BODY}"):
+    return f'<link name="{name}">{content}</link>'
+
+
+def joint(name, parent, child, kind="fixed", content=""):
+    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<joint name="{name}" type="{kind}">{ends}{content}</joint>'
+
+
+def arm(tmp_path, held, child="{BODY}"):
+    """Two links held by a joint called j, whose type and inner XML are given."""
+    kind, _, inner = held.partition("|")
+    parts = link("base_link"), link("hand", child), joint("j", "base_link", "hand", kind, inner)
+    return urdf(tmp_path, "\n".join(parts))
 
 
 def converted(path, **options):
@@ -39,6 +45,19 @@ def converted(path, **options):
     stage = Usd.Stage.Open(str(out))
     stage.Reload()
     return stage, stage.GetDefaultPrim(), report
+
+
+def link_poses(path, values):
+    """T_root_link of each link by yourdfpy, shape (4, 4), with joints at values by name; mimics follow."""
+    peer = yourdfpy.URDF.load(str(path), load_meshes=False)
+    peer.update_cfg(dict(values))
+    return {link.name: peer.get_transform(link.name, peer.base_link) for link in peer.robot.links}
+
+
+def masses(stage):
+    """Mass of each body by name [kg]."""
+    bodies = [prim for prim in stage.Traverse() if prim.HasAPI(UsdPhysics.RigidBodyAPI)]
+    return {body.GetName(): UsdPhysics.MassAPI(body).GetMassAttr().Get() for body in bodies}
 
 
 def prim(robot, name):

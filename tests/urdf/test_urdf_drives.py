@@ -1,8 +1,5 @@
 """Default drives of joints that bear a load: gains, motors, and what holds a position."""
 
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from made import converted, drive_of, prim, urdf
@@ -51,12 +48,6 @@ def test_a_load_of_10_hz_needs_no_motor_and_a_drive_by_the_user_gets_none(tmp_pa
     _stage, robot, _ = converted(finger(tmp_path, 30, 1e-9), drives=(rule,))
     assert_allclose(drive_of(robot, "j")[1], 70, rtol=1e-6)
     assert not prim(robot, "j").GetAttribute("newton:armature").HasAuthoredValue()
-
-
-def test_a_slide_of_little_mass_gets_a_motor_in_kilograms(tmp_path):
-    _stage, robot, _ = converted(finger(tmp_path, 30, 1e-9, kind="prismatic"))
-    assert_allclose(drive_of(robot, "j", "linear")[1], 100, rtol=1e-6)
-    assert_allclose(prim(robot, "j").GetAttribute("newton:armature").Get(), 100 / SQUARE - 1e-3, rtol=5e-3)
 
 
 LEG = """<link name="base">{INERTIAL}</link><link name="thigh">{INERTIAL}</link>
@@ -135,23 +126,3 @@ def test_moments_in_single_precision_are_those_of_a_body_too(tmp_path, case):
             np.sort([small, large, small + large if case == "plate" else large])[1:],
             rtol=3e-6,
         )
-
-
-def test_a_trial_of_the_zoo_starts_within_the_limits_of_the_joints(monkeypatch):
-    newton = pytest.importorskip("newton", reason="Newton is in the extra physics")
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks" / "zoo"))
-    from newton_trial import put_within_limits
-
-    kinds = newton.JointType
-    builder = SimpleNamespace(
-        joint_type=[kinds.FREE, kinds.REVOLUTE, kinds.FIXED, kinds.PRISMATIC, kinds.REVOLUTE],
-        joint_q_start=[0, 7, 8, 8, 9],
-        joint_qd_start=[0, 6, 7, 7, 8],
-        joint_q=[0.0] * 10,
-        joint_limit_lower=[-1e10] * 6 + [-2.0, 0.1, -1.0],
-        joint_limit_upper=[1e10] * 6 + [-0.5, 0.2, 1.0],
-        joint_mimic_joint=[-1, -1, -1, -1, 1],
-        joint_mimic_coeffs=[(0, 1)] * 4 + [(0.25, -2.0)],
-    )
-    put_within_limits(builder)
-    assert builder.joint_q == [0.0] * 7 + [-0.5, 0.1, 1.25]

@@ -11,7 +11,7 @@ from magtwin.errors import InputError
 from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.description.description import read_description
 from magtwin.urdf.source.expression import GLOBALS, Budget, ExpressionError, evaluate
-from magtwin.urdf.source.package import MissingFileError, Packages
+from magtwin.urdf.source.package import MissingFileError
 from magtwin.urdf.source.source import read_source
 
 URDF = DATA / "urdf"
@@ -51,7 +51,7 @@ REFUSED = {
     "frame_of_a_generator.xacro": r":2: attribute 'gi_frame' of type list is not allowed",
     "format_of_a_text.xacro": r":2: method 'format' of type str is not allowed; allowed: capitalize, count",
     "include_climbs.xacro": r":2: include '.*etc/passwd' lies outside .*urdf and of all packages; name its",
-    "include_pattern_climbs.xacro": r":2: include '/etc' lies outside",
+    "include_pattern_climbs.xacro": r":2: include '.*' has a wildcard",
     "include_not_there.xacro": r"missing: include 'input_not_there\.xacro' \(.*\.xacro:2\); put",
     "include_of_itself.xacro": r":2: expands without end: a macro or an include leads to itself",
     "include_with_entities.xacro": r"input_refused_entity_bomb\.urdf:2: has a DOCTYPE",
@@ -102,15 +102,6 @@ def test_a_bad_input_is_refused_in_one_line_with_file_and_line(name):
 
 def test_every_bad_input_has_its_message():
     assert {f"input_refused_{name}" for name in REFUSED} == {p.name for p in URDF.glob("input_refused_*")}
-
-
-def test_what_is_not_there_is_refused_with_the_near_name():
-    with pytest.raises(InputError, match=r"no such URDF file; did you mean 'input_capsule\.urdf'"):
-        read_source(URDF / "input_capsul.urdf")
-    with pytest.raises(InputError, match=r"cannot be read .*; expected a URDF file"):
-        read_source(URDF)
-    with pytest.raises(MissingFileError, match="is missing"):
-        read(URDF / "input_refused_mesh_missing.urdf")
 
 
 def test_arguments_that_nobody_asks_for_are_refused(tmp_path):
@@ -178,6 +169,7 @@ COSTLY = {
     "[l.count(-1) for l in [list(range(9000))] for i in range(100)]": "expands without end",
     "[-1 in l for l in [list(range(9000))] for i in range(100)]": "expands without end",
     "[l == l for l in [list(range(9000))] for i in range(100)]": "expands without end",
+    "[s - s for s in [set(range(9000))] for i in range(100)]": "expands without end",
     "[l[1:] for l in [list(range(9000))] for i in range(100)]": "expands without end",
     "[python.sum(values=l) for l in [list(range(9000))] for i in range(100)]": "expands without end",
     "[1 for i in range(300) for j in range(300)]": "over 65536 characters or entries",
@@ -210,7 +202,7 @@ SLIPS = {
     "<a x=\"${xacro.tokenize('a b', '')}\"/>": "tokenize: sep is empty",
     r"""<a x="${'\ud800'}"/>""": "half of a character",
     """<a x="${'%c' % 0xdfff}"/>""": "half of a character",
-    '<xacro:include filename="*/../../*/*.none"/>': r"has '\.\.' after a wildcard; leave it out",
+    '<xacro:include filename="*/../../*/*.none"/>': "has a wildcard; name each file",
     """<xacro:macro name="m" params="a:=bbbbbbbbbbbbbbbbbbbbbbbbbbbbb'"/><xacro:m/>""": "Undefined par",
     '<l x="${xacro}"/>': "a .* is not a value",
     '<l x="$(cwd)"/>': r"\$\(cwd\) is not known; known: arg, dirname, env, eval, find, optenv",
@@ -226,16 +218,6 @@ def test_a_mistake_in_a_xacro_is_refused_with_its_line(tmp_path, slip):
         read_source(write_xacro(tmp_path, slip))
 
 
-def test_messages_and_hidden_problems_of_a_xacro_are_noted(tmp_path):
-    body = '<l x="${xacro.warning(\'careful\')}"/><xacro:property name="e" value="2"/>'
-    body += '<xacro:include filename="none*.xacro"/>'
-    assert read_source(write_xacro(tmp_path, body)).repairs.notes == (
-        "arm.xacro:2: careful",
-        "arm.xacro:2: redefining global symbol: e",
-        "arm.xacro:2: include 'none*.xacro' matches no file",
-    )
-
-
 def test_a_xacro_does_not_read_the_environment(tmp_path, monkeypatch):
     monkeypatch.setenv("ARM_MODE", "secret")
     path = write_xacro(tmp_path, '<link name="$(optenv ARM_MODE quiet)"/>')
@@ -247,14 +229,6 @@ def test_a_xacro_does_not_read_the_environment(tmp_path, monkeypatch):
     given = read_source(path, arguments={"ARM_MODE": "loud"})
     assert given.xml.find("link").get("name") == "loud"
     assert given.repairs.notes == ()
-
-
-def test_symbolic_links_do_not_leave_the_folder(tmp_path):
-    (tmp_path / "secret.xacro").write_text(XACRO.format('<link name="secret"/>'))
-    path = write_xacro(tmp_path, '<xacro:include filename="inner.xacro"/>', "robot/arm.xacro")
-    (tmp_path / "robot" / "inner.xacro").symlink_to(tmp_path / "secret.xacro")
-    with pytest.raises(InputError, match=r"include .* lies outside .*/robot and of all packages"):
-        read_source(path)
 
 
 # --- the language of expressions ------------------------------------------------------------------
@@ -291,7 +265,7 @@ VALUES = {
     "not 1 < 2 < 3": False,
     "max([1, 3], key=lambda x: -x)": 1,
     "python.sum(python.enumerate([5, 7])[1])": 8,
-    "python.set([2, 1, 2])": [2, 1],
+    "set([3, 1, 3, 2]) - set([1])": [3, 2],
     "name in ['arm'] and None is None": True,
 }
 
@@ -361,13 +335,6 @@ def test_given_packages_win_over_those_above_and_those_beside(tmp_path):
     assert found(path) == path.parents[1] / "meshes" / "a.stl"
 
 
-def test_a_folder_with_the_packages_name_needs_no_manifest(tmp_path):
-    path = robot(tmp_path / "urdf")
-    (tmp_path / "hand" / "meshes").mkdir(parents=True)
-    (tmp_path / "hand" / "meshes" / "a.stl").write_text("")
-    assert found(path) == tmp_path / "hand" / "meshes" / "a.stl"
-
-
 def test_a_description_does_not_choose_any_folder_around_it_as_its_package(tmp_path):
     path = robot(tmp_path / "homes" / "me" / "downloads" / "arm")
     (tmp_path / "homes" / "me" / "private").mkdir()
@@ -413,11 +380,6 @@ def test_the_search_for_packages_is_bounded_and_ignores_what_is_hidden_or_broken
     monkeypatch.setattr("magtwin.urdf.source.package.FOLDERS", 2)
     with pytest.raises(InputError, match=r"around it \(the search ended after 2 folders\); give"):
         found(path)
-
-
-def test_a_given_package_must_be_a_folder(tmp_path):
-    with pytest.raises(InputError, match=r"package 'hand': .*nowhere is not a folder"):
-        Packages({"hand": tmp_path / "nowhere"}, tmp_path / "arm.urdf")
 
 
 # --- the real robot -------------------------------------------------------------------------------

@@ -5,13 +5,11 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 
 from magtwin.urdf.meshes.collider import hull_faces
 from magtwin.urdf.meshes.mesh import _distinct_words, distinct
-from magtwin.urdf.physics.articulation import _overlap
-from magtwin.urdf.physics.inertia import is_closed, polyhedron
+from magtwin.urdf.physics.inertia import is_closed
 from magtwin.usd.solids import CREASE, capsule, corner_normals
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -40,18 +38,6 @@ def test_rows_are_told_apart_with_and_without_keys(seed, width):
     words = np.ascontiguousarray(rows + np.float32(0)).view(np.uint32)
     for fast, slow in zip((first, kind), _distinct_words(words), strict=True):
         assert_array_equal(fast, slow)
-
-
-@settings(max_examples=60, deadline=None)
-@given(seed=SEEDS, kinds=st.tuples(st.integers(0, 3), st.integers(0, 3)), apart=st.floats(0, 4))
-def test_hulls_overlap_where_a_linear_program_has_a_solution(seed, kinds, apart):
-    rng = np.random.default_rng(seed)
-    a, b = (cloud(rng, kind) for kind in kinds)
-    b = b + apart * rng.normal(size=3) + 1e-4 * rng.normal(size=3)
-    ones = np.concatenate([np.ones(len(a)), np.zeros(len(b))])
-    equal = np.vstack([np.hstack([a.T, -b.T]), ones, 1 - ones])
-    found = linprog(np.zeros(len(ones)), A_eq=equal, b_eq=[0, 0, 0, 1, 1], bounds=(0, None), method="highs")
-    assert _overlap(a, b) == (found.status == 0)
 
 
 @settings(max_examples=40, deadline=None)
@@ -97,21 +83,6 @@ def test_a_corners_normal_is_the_mean_of_the_faces_within_the_crease(seed, flat)
             near = around[unit[around] @ unit[face] >= np.cos(CREASE)]
             mean = area[near].sum(axis=0)
             assert_allclose(made[face, k], mean / np.linalg.norm(mean), atol=1e-5)
-
-
-@settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_a_filled_mesh_weighs_what_trimesh_finds(seed):
-    rng = np.random.default_rng(seed)
-    points, faces = capsule(0.1, 0.3)
-    T = rng.normal(size=(3, 3))
-    points, faces = points @ T.T + rng.normal(size=3), faces[:, :: 1 if np.linalg.det(T) > 0 else -1]
-    peer = trimesh.triangles.mass_properties(points[faces])
-    solid = polyhedron(points, faces)
-    assert_allclose(solid.mass, peer.volume, rtol=1e-9)
-    assert_allclose(solid.centre, peer.center_mass, rtol=0, atol=1e-8)
-    # the peer sums about the origin of the world, which is metres away
-    assert_allclose(solid.inertia, peer.inertia, rtol=0, atol=1e-9 * (1 + np.trace(peer.inertia)))
 
 
 @settings(max_examples=30, deadline=None)

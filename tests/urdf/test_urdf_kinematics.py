@@ -2,14 +2,12 @@
 
 import numpy as np
 import pytest
-from made import urdf
+from made import joint, link, urdf
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics
 
-from magtwin.author.from_urdf import link_poses
-from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat
-from magtwin.urdf import convert_urdf
+from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.options import Options
 
 POSES = 100
@@ -121,15 +119,11 @@ def compare(path, out, rng, *, still=()):
     return len(mine)
 
 
-def arms(name, joints):
+def arms(joints):
     """A chain of links held by (type, inner XML) each."""
-    parts = ['<link name="l0">{BODY}</link>']
+    parts = [link("l0")]
     for i, (kind, inner) in enumerate(joints):
-        parts.append(f'<link name="l{i + 1}">{{BODY}}</link>')
-        parts.append(
-            f'<joint name="j{i + 1}" type="{kind}"><parent link="l{i}"/><child link="l{i + 1}"/>'
-            f"{inner}</joint>"
-        )
+        parts += [link(f"l{i + 1}"), joint(f"j{i + 1}", f"l{i}", f"l{i + 1}", kind, inner)]
     return "\n".join(parts)
 
 
@@ -161,7 +155,7 @@ TREE = """
 
 
 @pytest.mark.parametrize("merge", [False, True])
-@pytest.mark.parametrize(("name", "body"), [("chain", arms("chain", CHAIN)), ("tree", TREE)])
+@pytest.mark.parametrize(("name", "body"), [("chain", arms(CHAIN)), ("tree", TREE)])
 def test_links_of_a_robot_with_every_joint_of_one_axis_stand_where_yourdfpy_puts_them(
     tmp_path, name, body, merge
 ):
@@ -183,7 +177,7 @@ def test_a_planar_joint_slides_and_turns_in_its_plane_only(tmp_path):
     normal = np.array([0.2, -0.6, 0.77])
     words = " ".join(map(str, normal))
     chain = [("planar", f'<origin xyz="0.1 0.2 0.3" rpy="0.3 -0.7 1.1"/><axis xyz="{words}"/>'), CHAIN[0]]
-    path = urdf(tmp_path, arms("sled", chain), "sled")
+    path = urdf(tmp_path, arms(chain), "sled")
     stage = StageKinematics(convert_urdf(path, tmp_path / "sled.usda", options=Options(single_file=True)))
     joint = stage.joints["j1"]
     limits = {
@@ -215,35 +209,3 @@ def test_a_floating_joint_holds_nothing_and_a_floating_base_is_the_base(tmp_path
     assert set(stage.joints) == {"finger", "other", "swing"}
     assert stage.robot.GetPrimAtPath("base/base_footprint")
     assert_allclose(stage.poses({})["plate"][:3, 3], [0.1, 0, 0.3], atol=1e-9)
-
-
-FOLLOWERS = arms(
-    "followers",
-    [
-        ("prismatic", f'<axis xyz="0 3 4"/>{LIMIT}'),  # of length 5
-        ("revolute", f'<axis xyz="0 0 2"/>{LIMIT}<mimic joint="j1" multiplier="2" offset="0.1"/>'),
-        ("revolute", f'<origin xyz="1 0 0"/><axis xyz="0 0 1"/>{LIMIT}<mimic joint="j2" multiplier="-1"/>'),
-    ],
-)
-
-
-def test_links_stand_where_an_axis_of_any_length_and_followers_of_followers_put_them(tmp_path):
-    poses = link_poses(urdf(tmp_path, FOLLOWERS, "followers"), {"j1": 0.5})
-    turn = 2 * 0.5 + 0.1
-    assert list(poses) == ["l0", "l1", "l2", "l3"]
-    assert_allclose(poses["l1"][:3, 3], [0, 0.3, 0.4], atol=1e-15)
-    assert_allclose(poses["l2"][:2, 0], [np.cos(turn), np.sin(turn)], atol=1e-15)
-    assert_allclose(poses["l3"][:3, :3], np.eye(3), atol=1e-15)
-    assert_allclose(poses["l3"][:3, 3], [np.cos(turn), 0.3 + np.sin(turn), 0.4], atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("positions", "text"),
-    [
-        ({"j9": 1.0}, "no joint with one position 'j9'; known: j1, j2, j3"),
-        ({"j2": 1.0}, "joint 'j2' follows 'j1'; give that one's"),
-    ],
-)
-def test_a_position_that_no_joint_takes_is_refused(tmp_path, positions, text):
-    with pytest.raises(InputError, match=text):
-        link_poses(urdf(tmp_path, FOLLOWERS, "followers"), positions)

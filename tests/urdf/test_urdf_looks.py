@@ -9,9 +9,7 @@ from pxr import Gf, UsdShade
 from test_urdf_geometry import SQUARES, dae, meshes_of, notes_of, picture, robot, surface_of, visual
 from validators import assert_valid
 
-from magtwin.errors import InputError
 from magtwin.urdf.meshes.mesh import read_mesh
-from magtwin.urdf.options import Options
 from magtwin.usd.geometry import linear_from_srgb
 
 UP = (128, 128, 255)
@@ -97,43 +95,6 @@ def test_a_colour_multiplies_its_texture_unless_it_is_black(tmp_path):
     assert_allclose(textures(surface)["diffuseColor"][3][:3], linear_from_srgb([0.5, 0.25, 1]), atol=1e-5)
     _, surface = blue(tmp_path, "Kd 0 0 0\nmap_Kd t.png")
     assert_allclose(textures(surface)["diffuseColor"][3], [1, 1, 1, 1])
-
-
-LOST = {
-    "map_Bump h.png": "squares.obj: material 'blue': its map of heights 'h.png' is left out",
-    "map_Ks h.png": "squares.obj: material 'blue': its map of highlights (map_ks) is left out",
-    "disp h.png": "squares.obj: material 'blue': its map of displacements (disp) is left out",
-    "Ke bright": "squares.obj: material 'blue' has malformed Ke, Ks, Ns, Pr, Pm or Ni; left out",
-}
-
-
-@pytest.mark.parametrize("line", LOST)
-def test_what_a_material_loses_is_reported_and_strict_refuses_it(tmp_path, line):
-    picture(tmp_path / "h.png", [(90, 90, 90)])
-    stage, _ = blue(tmp_path, f"Kd 1 1 1\n{line}")
-    assert LOST[line] in notes_of(stage)
-    with pytest.raises(InputError, match=r"squares\.obj: material 'blue'"):
-        blue(tmp_path, f"Kd 1 1 1\n{line}", options=Options(strict=True))
-
-
-def test_a_normal_map_in_the_place_of_a_map_of_heights_is_used_as_such(tmp_path):
-    picture(tmp_path / "n.png", [UP])
-    _, surface = blue(tmp_path, "Kd 1 1 1\nmap_Bump -bm 1 n.png")
-    assert textures(surface)["normal"][0] == "n.png"
-
-
-def test_a_texture_without_coordinates_becomes_its_mean_with_a_note(tmp_path):
-    picture(tmp_path / "t.png", [(255, 0, 0), (0, 0, 0)])
-    lines = [line for line in SQUARES.splitlines() if not line.startswith("vt")]
-    text = "\n".join(" ".join(w.split("/")[0] for w in line.split()) for line in lines)
-    (tmp_path / "o.obj").write_text(text)
-    (tmp_path / "paint.mtl").write_text("newmtl red\nmap_Kd t.png\nnewmtl blue\nKd 0 0 1\n")
-    red = read_mesh(tmp_path / "o.obj").paints[0]
-    assert red.image is None
-    assert_allclose(red.rgba, [0.5, 0, 0, 1], atol=0.01)
-    notes = notes_of(robot(tmp_path, visual("o.obj")))
-    text = "o.obj: material 'red': its textures are left out where there are no texture coordinates"
-    assert text in notes
 
 
 def shaded(tmp_path, shader, extra="", images=""):

@@ -122,15 +122,6 @@ base_controller:
     wheel_radius: 0.11
     linear: {x: {has_velocity_limits: true, max_velocity: 1.3}}
 """
-OLD_MECANUM = """\
-base_controller:
-  type: mecanum_drive_controller/MecanumDriveController
-  front_left_wheel_joint: fl
-  back_left_wheel_joint: rl
-  front_right_wheel_joint: fr
-  back_right_wheel_joint: rr
-  linear: {x: {max_velocity: 1.3}}
-"""
 CLEARPATH = """\
 base_controller:
   ros__parameters:
@@ -146,7 +137,7 @@ base_controller:
 
 @pytest.mark.parametrize(
     ("text", "separation", "radius"),
-    [(MECANUM, 0.62 + 1.5 * 0.52, 0.11), (OLD_MECANUM, TRACK + BASE, R), (CLEARPATH, 1.4, 0.11)],
+    [(MECANUM, 0.62 + 1.5 * 0.52, 0.11), (CLEARPATH, 1.4, 0.11)],
 )
 def test_settings_of_mecanum_controllers_old_and_new(tmp_path, text, separation, radius):
     settings = tmp_path / "control.yaml"
@@ -201,16 +192,6 @@ def test_wheels_are_found_by_their_joints_and_casters_and_arms_are_none(tmp_path
     _, drive, report = rover(tmp_path, wheels=caster)
     assert drive.sides == {"fl": 0, "fr": 1}
     assert any(note.startswith("drive from the joints: simulated") for note in report.notes)
-
-
-def test_wheels_of_a_revolute_joint_with_a_range_of_many_turns_are_driven(tmp_path):
-    limit = '<limit lower="-180" upper="180" effort="10" velocity="20"/>'
-    stage, drive, _ = rover(tmp_path, joint="revolute", limit=limit)
-    assert drive.sides == SIDES
-    assert_allclose(drive.wheel_rate_max, 20)
-    joint = next(p for p in stage.Traverse() if p.GetName() == "fl")
-    assert UsdPhysics.DriveAPI(joint, "angular").GetStiffnessAttr().Get() == 0
-    assert UsdPhysics.DriveAPI(joint, "angular").GetDampingAttr().Get() > 0
 
 
 def test_a_plugin_that_moves_the_base_without_wheels_takes_those_of_the_joints(tmp_path):

@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from places import TESTS
-from pxr import Usd, UsdGeom, UsdPhysics
 from scipy.optimize import nnls
 
 from magtwin.errors import InputError
@@ -15,7 +14,6 @@ from magtwin.urdf.convert import convert_with_report
 from magtwin.urdf.options import Options
 from magtwin.urdf.physics.inertia import SLIMMEST, nearest_possible
 from magtwin.urdf.repairs import FAULTS
-from magtwin.urdf.source.source import read_source
 
 HEAD = '<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">'
 BASE = '<link name="base"><inertial><mass value="2"/>{}</inertial>{}</link>'
@@ -100,7 +98,6 @@ FAULTY = {
         (BASE.format(TENSOR.replace("1", "0"), ""), 2, "that of a ball of water"),
         (BASE.format("", f"<collision>{BALL}</collision>"), 2, "that of its colliders"),
     ],
-    "inertia-asymmetric": [(BASE.format(TENSOR.replace("/>", ' iyx="0.1"/>'), ""), 2, "ixy 0 and iyx 0.1")],
     "inertia-unreadable": [(BASE.format(TENSOR.replace('ixx="1"', 'ixx="big"'), ""), 2, "counts as none")],
     "mass-invalid": [
         (held(HAND.replace('"2"', '"-2"')), 3, "a mass of -2"),
@@ -187,7 +184,6 @@ FAULTY = {
     "tag-misplaced": [
         (look(BALL.replace("</", f"{RED}</")), 2, "<material> moved into the <material> of its visual"),
         (look(f'{BALL}<color rgba="1 0 0 1"/>'), 2, "<color> moved"),
-        (BASE.format(TENSOR, f"<visual>{BALL}</visual>{RED}"), 2, "moved from the link to its visuals"),
     ],
     "tag-empty": [
         (look(f'{BALL}<material name="m"><texture/></material>'), 2, "a <texture> without filename="),
@@ -206,15 +202,7 @@ FAULTY = {
         (f"{RED}\n{RED}\n{GOOD}", 2, "twice, alike"),
         (f"{RED}\n{RED.replace('1 0 0 1', '0 1 0 1')}\n{GOOD}", 2, "twice, with two looks"),
     ],
-    "name-twice": [
-        (f"{GOOD}\n{GOOD}", 3, "link 'base' exists twice, first on line 2: the second is equal and left out"),
-        (f"{GOOD}\n{HAND}\n{TIP}\n{joint('fixed')}\n{joint('fixed', child='tip')}", 7, "is called 'j_2'"),
-        (
-            held(f"{HAND}\n{look(BALL).replace('base', 'hand')}") + joint("fixed", name="k"),
-            4,
-            "is called 'hand_2'",
-        ),
-    ],
+    "name-twice": [(f"{GOOD}\n{GOOD}", 3, "'base' exists twice, first at arm.urdf:2: the second is equal")],
     "name-unknown": [
         (f'{GOOD}\n<transmission name="t"><joint name="nobody"/></transmission>', 3, "no joint 'nobody'"),
         (f'{GOOD}\n<ros2_control name="c"><joint name="jj"/></ros2_control>', 3, "no joint 'jj'"),
@@ -228,13 +216,13 @@ FAULTY = {
     ],
     "name-missing": [(f"{GOOD}", 1, "<robot> has no name: 'arm', as its file")],
     "mesh-missing": [
-        (meshed("nowhere.stl"), 2, "a box of 1.73 x 1.73 x 1.73 m"),
+        (meshed("nowhere.stl"), 2, "a box of 0.05 x 0.05 x 0.05 m"),
         (meshed("package://absent/a.stl"), 2, "a box of"),
         (meshed("https://example.com/a.stl"), 2, "a box of"),
     ],
     "mesh-unreadable": [
-        (meshed("broken.stl"), 2, "cannot be read: a box"),
-        (meshed("a.step"), 2, "cannot be read: a box"),
+        (meshed("broken.stl"), 2, "cannot be read (broken.stl: "),
+        (meshed("a.step"), 2, "no known format"),
     ],
     "mesh-flat": [(meshed("flat.stl", "collision"), 2, "as a plate 0.0071 m")],
     "file-name": [
@@ -253,10 +241,8 @@ FAULTY = {
             "$(find absent): no such package",
         )
     ],
-    "macro-unknown": [(f'{GOOD}\n<xacro:lidar name="l"/>', 3, "<xacro:lidar> is no macro: left out")],
     "include-renamed": [(included("eye.xacro"), 3, "'eye.xacro' is missing: eye.urdf.xacro beside it")],
     "include-skipped": [(included("$(find absent)/eye.xacro"), 3, "eye.xacro' is missing: skipped")],
-    "declaration-late": [(GOOD, 3, "blank lines before"), (f"{GOOD}<!-- xacro -->", 3, "blank lines before")],
 }
 """Descriptions with one fault: the text, its line (0 if it has none), and a part of the report's text."""
 
@@ -266,8 +252,7 @@ CASES = [(kind, number) for kind, cases in FAULTY.items() for number in range(le
 def write(tmp_path, kind, number):
     text, line, told = FAULTY[kind][number]
     head = HEAD.replace(' name="arm"', "") if kind == "name-missing" else HEAD
-    head = f"\n \n<?xml version='1.0'?>\n{head}" if kind == "declaration-late" else head
-    xacro = kind in ("package-missing", "include-renamed", "include-skipped") or "<!-- xacro" in text
+    xacro = kind in ("package-missing", "include-renamed", "include-skipped")
     folder = tmp_path / "arms"
     folder.mkdir()
     (folder / "package.xml").write_text("<package><name>arms</name></package>")
@@ -282,13 +267,6 @@ def write(tmp_path, kind, number):
     path.parent.mkdir(exist_ok=True)
     path.write_text(f"{head}\n{text}\n</robot>\n")
     return path, line, told
-
-
-def test_a_flat_collider_is_reported_once_and_not_as_a_changed_box_too(tmp_path):
-    path, _line, _told = write(tmp_path, "mesh-flat", 0)
-    report = convert_with_report(path, tmp_path / "a" / "arm.usda")
-    assert [(row.kind, row.count) for row in report.repairs] == [("mesh-flat", 1)]
-    assert report.losses == ()
 
 
 def test_what_a_mesh_file_loses_is_reported_with_the_file(tmp_path):
@@ -342,11 +320,10 @@ def test_strict_names_all_faults_and_the_options_that_supply_what_is_missing(tmp
     )
     path = tmp_path / "arm.urdf"
     path.write_text(f"{HEAD}\n{BASE.format(TENSOR, '<colision/>' + shapes)}\n</robot>")
-    for options in (Options(strict=True), Options(missing_meshes="refuse")):
-        with pytest.raises(InputError) as refusal:
-            convert_with_report(path, tmp_path / "arm.usda", options=options)
-        for part in ("package://x/a.stl", "package://y/a.stl", "--package x=FOLDER --package y=FOLDER"):
-            assert part in str(refusal.value)
+    with pytest.raises(InputError) as refusal:
+        convert_with_report(path, tmp_path / "arm.usda", options=Options(strict=True))
+    for part in ("package://x/a.stl", "package://y/a.stl", "--package x=FOLDER --package y=FOLDER"):
+        assert part in str(refusal.value)
     report = convert_with_report(path, tmp_path / "arm.usda")
     assert report.supply == "--package x=FOLDER --package y=FOLDER"
     shown = {figure.name: (figure.value, figure.note) for figure in report.summary().figures}
@@ -377,61 +354,19 @@ def test_what_a_xacro_lacks_is_listed_in_one_run(tmp_path):
             assert text in str(refusal.value)
 
 
-def test_properties_of_a_skipped_include_are_listed_and_come_from_arguments(tmp_path):
-    path = tmp_path / "arm.xacro"
-    lines = [
-        '<xacro:include filename="$(find units)/deg.xacro"/>',
-        '<xacro:property name="turn" value="${90 * deg + inch}"/>',
-        '<link name="base"/><link name="hand"/>',
-        '<joint name="j" type="fixed"><parent link="base"/><child link="hand"/>',
-        '<origin xyz="${1 / inch} 0 0" rpy="0 0 ${turn}"/></joint>',
-    ]
-    path.write_text("\n".join([HEAD, *lines, "</robot>"]))
-    with pytest.raises(InputError) as refusal:
-        convert_with_report(path, tmp_path / "arm.usda")
-    text = refusal.value.in_flags({"skip_missing_includes": "--skip-missing-includes"})
-    for part in (
-        "include 'package://units/deg.xacro' (arm.xacro:2), property 'inch' (arm.xacro:6), property 'deg'",
-        "give --package units=FOLDER, or --skip-missing-includes --arg inch=VALUE --arg deg=VALUE",
-    ):
-        assert part in text
-    given = {"inch": "0.5", "deg": "0.01"}
-    options = Options(arguments=given, skip_missing_includes=True)
-    report = convert_with_report(path, tmp_path / "arm.usda", options=options)
-    assert [(row.kind, row.count) for row in report.repairs] == [("include-skipped", 1)]
-    source = read_source(path, arguments=given, skip_missing_includes=True)
-    origin = source.xml.find("joint/origin")
-    assert_allclose(float(origin.get("rpy").split()[2]), 90 * 0.01 + 0.5, rtol=1e-12)
-    assert_allclose(float(origin.get("xyz").split()[0]), 2, rtol=1e-12)
-    with pytest.raises(InputError, match="no xacro argument 'width'"):
-        read_source(path, arguments=given | {"width": "1"}, skip_missing_includes=True)
-    properties = [f'<xacro:property name="{name}" value="1"/>' for name in given]
-    (tmp_path / "deg.xacro").write_text("\n".join([HEAD, *properties, "</robot>"]))
-    path.write_text(path.read_text().replace("$(find units)/", ""))
-    with pytest.raises(InputError, match="no xacro argument 'inch'"):  # an argument replaces no property
-        read_source(path, arguments=given, skip_missing_includes=True)
-
-
 def test_packages_of_ros_are_found_by_the_name_in_the_description_and_only_so(tmp_path, monkeypatch):
     box = trimesh.creation.box()
-    for folder in ("install/share/hands", "install/share/other", "ws/src/eyes"):
+    for folder in ("install/share/hands", "install/share/other"):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / "package.xml").write_text("<package/>")
         box.export(tmp_path / folder / "a.stl")
     path = tmp_path / "here" / "deep" / "er" / "still" / "arm.urdf"
     path.parent.mkdir(parents=True)
-    names = ("hands", "eyes")
-    shapes = "".join(
-        f'<visual><geometry><mesh filename="package://{n}/a.stl"/></geometry></visual>' for n in names
-    )
-    path.write_text(f"{HEAD}\n{BASE.format(TENSOR, shapes)}\n</robot>")
+    path.write_text(f"{HEAD}\n{meshed('package://hands/a.stl')}\n</robot>")
     monkeypatch.setenv("AMENT_PREFIX_PATH", f"{tmp_path}/none:{tmp_path}/install")
-    monkeypatch.setenv("ROS_PACKAGE_PATH", f"{tmp_path}/ws")
     assert not convert_with_report(path, tmp_path / "arm.usda").repairs
     outside = tmp_path / "install" / "share" / "other" / "a.stl"
-    path.write_text(
-        f"{HEAD}\n{look(f'<geometry><mesh filename={chr(34)}{outside}{chr(34)}/></geometry>')}\n</robot>"
-    )
+    path.write_text(f"{HEAD}\n{meshed(outside)}\n</robot>")
     with pytest.raises(InputError, match="lies outside"):
         convert_with_report(path, tmp_path / "b.usda")
 
@@ -441,9 +376,7 @@ def test_a_folder_of_meshes_beside_a_folder_urdf_is_read_and_nothing_else_there(
         (tmp_path / folder).mkdir()
         trimesh.creation.box().export(tmp_path / folder / "a.stl")
     path = tmp_path / "urdf" / "arm.urdf"
-    path.write_text(
-        f"{HEAD}\n{look('<geometry><mesh filename=' + repr('../meshes/a.stl') + '/></geometry>')}</robot>"
-    )
+    path.write_text(f"{HEAD}\n{meshed('../meshes/a.stl')}</robot>")
     assert not convert_with_report(path, tmp_path / "a.usda").repairs
     path.write_text(path.read_text().replace("../meshes", "../secret"))
     with pytest.raises(InputError, match="lies outside"):
@@ -455,32 +388,20 @@ def test_a_path_that_names_no_package_leads_to_the_file_beside_the_description(t
     (tmp_path / name).parent.mkdir(exist_ok=True)
     trimesh.creation.box([0.1, 0.2, 0.3]).export(tmp_path / name)
     path = tmp_path / "arm.urdf"
-    mesh = f'<geometry><mesh filename="package:///{name}"/></geometry>'
-    path.write_text(f"{HEAD}\n{look(mesh)}\n</robot>")
+    path.write_text(f"{HEAD}\n{meshed(f'package:///{name}')}\n</robot>")
     report = convert_with_report(path, tmp_path / "usd" / "arm.usda")
     assert_allclose(np.subtract(*report.box_out[::-1]), [0.1, 0.2, 0.3], rtol=1e-6)
     (entry,) = [entry for row in report.repairs for entry in row.entries]
     assert entry.text == f"mesh 'package:///{name}' is read as {name!r}"
 
 
-def test_a_placeholder_has_the_inertia_of_its_link_or_the_box_of_its_other_shapes(tmp_path):
-    size, mass = np.array([0.1, 0.2, 0.4]), 3.0
-    a, b, c = size**2
-    ixx, iyy, izz = mass / 12 * np.array([b + c, a + c, a + b])
-    inertia = f'<inertia ixx="{ixx}" iyy="{iyy}" izz="{izz}" ixy="0" ixz="0" iyz="0"/>'
-    inertial = f'<inertial><origin xyz="1 0 0"/><mass value="{mass}"/>{inertia}</inertial>'
+def test_a_placeholder_has_the_box_of_the_other_shapes_of_its_link(tmp_path):
     lost = '<visual><origin xyz="5 5 5"/><geometry><mesh filename="lost.stl"/></geometry></visual>'
     shown = '<collision><origin xyz="0 0 1"/><geometry><box size="0.2 0.4 0.6"/></geometry></collision>'
     path = tmp_path / "arm.urdf"
-    cases = {"a": (inertial + lost, [1, 0, 0], size), "b": (shown + lost, [0, 0, 1], [0.2, 0.4, 0.6])}
-    for name, (body, centre, edges) in cases.items():
-        path.write_text(f'{HEAD}\n<link name="base">{body}</link>\n</robot>')
-        convert_with_report(path, tmp_path / name / "arm.usda")
-        stage = Usd.Stage.Open(str(tmp_path / name / "arm.usda"))
-        cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), [UsdGeom.Tokens.default_])
-        extent = cache.ComputeWorldBound(stage.GetPrimAtPath("/arm/base")).ComputeAlignedRange()
-        assert_allclose(extent.GetMidpoint(), centre, atol=1e-6)
-        assert_allclose(extent.GetSize(), edges, atol=2e-6)
+    path.write_text(f'{HEAD}\n<link name="base">{shown}{lost}</link>\n</robot>')
+    (low, high) = convert_with_report(path, tmp_path / "a" / "arm.usda").box_out
+    assert_allclose([low, high], [[-0.1, -0.2, 0.7], [0.1, 0.2, 1.3]], atol=1e-6)
 
 
 @given(st.lists(st.floats(-1, 1), min_size=6, max_size=6))
@@ -498,15 +419,3 @@ def test_the_nearest_possible_tensor_is_possible_and_no_other_is_nearer(values):
     assert_allclose(made, np.maximum(peer, SLIMMEST * peer.max()), atol=1e-7)
     again = nearest_possible(nearest)
     assert again is nearest or np.allclose(again, nearest, rtol=1e-5)
-
-
-def test_a_repaired_inertia_keeps_mass_and_axes(tmp_path):
-    path = tmp_path / "arm.urdf"
-    path.write_text(
-        f"{HEAD}\n{BASE.format(TENSOR.replace('izz=' + chr(34) + '1', 'izz=' + chr(34) + '3'), '')}</robot>"
-    )
-    convert_with_report(path, tmp_path / "arm.usda")
-    stage = Usd.Stage.Open(str(tmp_path / "arm.usda"))
-    mass = UsdPhysics.MassAPI(stage.GetPrimAtPath("/arm/base"))
-    assert mass.GetMassAttr().Get() == 2
-    assert_allclose(mass.GetDiagonalInertiaAttr().Get(), [4 / 3, 4 / 3, 8 / 3], rtol=1e-6)

@@ -3,12 +3,11 @@
 from pathlib import Path
 from xml.etree import ElementTree
 
+import made
 import numpy as np
 import pytest
 
-from magtwin.author.robot import read_description
 from magtwin.errors import InputError
-from magtwin.files.file import shipped
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.urdf.reroot import reroot
 
@@ -21,10 +20,7 @@ def robot(*joints: str) -> str:
 
 
 def joint(parent: str, child: str, kind: str = "fixed", xyz: str = "0 0 0", rpy: str = "0 0 0") -> str:
-    return (
-        f'<joint name="{parent}_{child}" type="{kind}"><origin xyz="{xyz}" rpy="{rpy}"/>'
-        f'<parent link="{parent}"/><child link="{child}"/></joint>'
-    )
+    return made.joint(f"{parent}_{child}", parent, child, kind, f'<origin xyz="{xyz}" rpy="{rpy}"/>')
 
 
 def frames(text: str) -> dict[tuple[str, str], np.ndarray]:
@@ -83,9 +79,3 @@ def test_an_invalid_origin_is_refused_with_its_joint() -> None:
     for xyz in ("1 2 x", "1 2"):
         with pytest.raises(InputError, match="footprint_base_link"):
             reroot(robot(joint("footprint", "base_link", xyz=xyz)), "base_link", HERE)
-
-
-def test_a_scene_in_a_folder_of_its_own_keeps_its_robots_description(lab_scene: Path) -> None:
-    shown = read_description(shipped("robots", "turtlebot4", "turtlebot4.usda"))
-    assert "<robot" in shown
-    assert read_description(lab_scene.parent / "robots" / "turtlebot4" / "turtlebot4.usda") == shown

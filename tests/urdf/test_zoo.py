@@ -123,23 +123,3 @@ def test_a_fault_of_a_row_is_named(monkeypatch, change, fault):
     row["newton"] = GOOD["newton"] | change.get("newton", {})
     found = table.faults(row)
     assert found == [] if fault is None else [f.startswith(fault) for f in found] == [True]
-
-
-@pytest.mark.parametrize(
-    ("name", "asset", "metres"),
-    [
-        ("m.dae", '<unit meter="1.000000" name="centimeter"/>', True),
-        ("m.dae", "<unit name='inch' meter = '0.0254'/>", False),
-        ("m.dae", "<up_axis>Z_UP</up_axis>", True),
-        ("m.stl", '<unit meter="0.0254"/>', True),
-    ],
-)
-def test_a_box_is_not_compared_if_yourdfpy_ignores_the_unit_of_a_mesh(
-    monkeypatch, tmp_path, name, asset, metres
-):
-    """It makes Laikago 13 m tall, whose trunk and calves are in inches."""
-    monkeypatch.syspath_prepend(str(ZOO))
-    from robot import in_metres
-
-    (tmp_path / name).write_text(f"<COLLADA><asset>{asset}</asset></COLLADA>")
-    assert in_metres(tmp_path / name) is metres

@@ -18,16 +18,12 @@ def robot(
     settings: Path | None = None,
     package: list[str] | None = None,
     arg: list[str] | None = None,
-    missing_meshes: Literal["box", "note", "refuse"] | None = None,
     skip_missing_includes: bool | None = None,
-    collision: Literal["hull", "decomposition", "mesh"] | None = None,
     profile: Literal["general", "diff-drive"] | None = None,
     drive: list[str] | None = None,
     controllers: Path | None = None,
     fix_base: bool | None = None,
     merge_fixed: bool | None = None,
-    density_kg_m3: float | None = None,
-    mass_kg: float | None = None,
     single_file: bool | None = None,
     strict: bool | None = None,
     thumbnail: Flag = False,
@@ -50,13 +46,8 @@ def robot(
         NAME=DIR: folder of a package that package:// or $(find) names. May be repeated.
     arg
         NAME=VALUE: argument of the xacro. May be repeated.
-    missing_meshes
-        What to do about a missing or unreadable mesh: a box of the link's size as a placeholder; leave it
-        out and note it; or refuse. Default: box.
     skip_missing_includes
         Skip files and packages that a xacro includes but that are missing, if none of their macros is called.
-    collision
-        Collision shape of a mesh: convex hull, convex decomposition (extra "decomposition"), or the mesh.
     profile
         general; or diff-drive: velocity drives on wheels, casters without friction, dead suspensions welded.
     drive
@@ -68,10 +59,6 @@ def robot(
         Fix the base to the world.
     merge_fixed
         Merge links on fixed joints into the body that carries them; their frames stay.
-    density_kg_m3
-        Density of links without inertia [kg/m3].
-    mass_kg
-        Mass of the data sheet to compare the robot's with [kg].
     single_file
         Write one root layer and its meshes, in place of Isaac Sim's layers.
     strict
@@ -96,15 +83,12 @@ def robot(
     from magtwin.author.from_urdf import DriveRule, from_urdf
 
     check_output(report, (".json",), "a report", force=force)
-    same = ["missing_meshes", "skip_missing_includes", "collision", "profile", "fix_base", "merge_fixed"]
-    same += ["single_file", "strict"]
+    same = ("skip_missing_includes", "profile", "fix_base", "merge_fixed", "single_file", "strict")
     choices = {name: given[name] for name in same} | {
         "packages": {name: Path(folder) for name, folder in pairs("package", package).items()} or None,
         "arguments": pairs("arg", arg, empty=True) or None,
         "drives": tuple(DriveRule.parse(text) for text in drive or ()) or None,
         "controllers": controllers,
-        "density": density_kg_m3,
-        "mass": mass_kg,
     }
     step("Converting the robot")
     with transaction(), output(report, force=force) if report is not None else nullcontext() as aside:

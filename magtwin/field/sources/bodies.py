@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.sources.dipoles import MU_0_OVER_4_PI, NT_PER_T, dipole_block, in_blocks, in_two_threads
+from magtwin.field.sources.moments import mesh_moments
 from magtwin.frames import matrix_from_quat
 
 Array = NDArray[np.float64]
@@ -106,25 +107,6 @@ class Body:
         """Distance of points from its bounding box [m], 0 inside, shape (N, 3) -> (N,)."""
         beyond = np.abs((p_world - self.p_world) @ self.rotation - self.middle) - self.size_m / 2
         return np.asarray(np.sqrt(np.square(np.maximum(beyond, 0)).sum(axis=1)))
-
-
-def mesh_moments(vertices: Array, faces: Triangles) -> tuple[float, Array, Array]:
-    """Volume [m3], centroid [m] (3,) and second moments about it per volume [m2] (3, 3) of a closed mesh.
-
-    Sums over the tetrahedra between a centre and each triangle (Tonon 2004, for the covariance).
-    """
-    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    corner = (vertices - middle)[faces]
-    volume = np.einsum("fi,fi->f", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6
-    total = volume.sum()
-    if not abs(total) > 0:
-        return 0.0, middle, np.zeros((3, 3))
-    whole = corner.sum(axis=1)
-    centroid = volume @ whole / 4 / total
-    second = np.einsum("f,fi,fj->ij", volume, whole, whole) + np.einsum(
-        "f,fki,fkj->ij", volume, corner, corner
-    )
-    return float(total), middle + centroid, second / 20 / total - np.outer(centroid, centroid)
 
 
 # Bodies in the Earth's field

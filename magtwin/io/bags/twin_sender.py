@@ -4,8 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from magtwin.errors import InputError
 from magtwin.frames import quat_from_rpy
 from magtwin.io.bags.sender import FixedFrame, Sender, Unit, WheelJoint, sender_of
@@ -65,14 +63,14 @@ def _footprint(description: str) -> tuple[FixedFrame, ...]:
     """The frame base_footprint of a URDF whose root is base_link. It has no body, so stages have no link."""
     if not description:
         return ()
+    from magtwin.urdf.description.model import origin_numbers
     from magtwin.urdf.source.markup import parse_markup
 
     for joint in parse_markup(description.encode(), Path("robot_description")).root.findall("joint"):
         ends = [element.get("link") for element in (*joint.findall("parent"), *joint.findall("child"))]
         if joint.get("type") == "fixed" and ends == ["base_link", FOOTPRINT]:
             origin = joint.find("origin")
-            text = {} if origin is None else origin.attrib
-            xyz, rpy = (np.array(text.get(name, "0 0 0").split(), float) for name in ("xyz", "rpy"))
-            q = np.array(text["quat_xyzw"].split(), float) if "quat_xyzw" in text else quat_from_rpy(rpy)
+            xyz, rpy, given = origin_numbers(joint if origin is None else origin)
+            q = quat_from_rpy(rpy) if given is None else given
             return (FixedFrame("base_link", FOOTPRINT, tuple(xyz.tolist()), tuple(q.tolist())),)
     return ()

@@ -29,9 +29,6 @@ UNIT = 1e-3
 LARGEST = 1e30
 """Larger numbers count as infinite: USD stores single precision, and volumes are cubes."""
 
-MIRRORED = {"iyx": "ixy", "izx": "ixz", "izy": "iyz"}
-"""Products of inertia below the diagonal, which URDF does not have, by those above it."""
-
 
 def check_grammar(part: Element, where: Callable[[Element], str], repair: Repair) -> Element:
     """Check a link, joint or material, and repair what has an evident reading.
@@ -133,34 +130,18 @@ class _Checker:
             self.repair("tag-misplaced", f"<{look.tag}> moved into the <material> of its visual", look)
 
     def _finish_link(self, clean: Element, link: Element) -> None:
-        """Give a link's own material to its visuals, and check its mass and inertia."""
-        materials = [child for child in link if child.tag == "material"]
-        for material in materials:
-            made = self.cleaned(material)
-            for visual in clean.findall("visual"):
-                if visual.find("material") is None and made is not None:
-                    visual.append(made)
-            self.repair("tag-misplaced", "<material> moved from the link to its visuals", material)
+        """Check a link's mass and inertia."""
         inertial, source = clean.find("inertial"), link.find("inertial")
         if inertial is not None and source is not None:
             self._check_inertia(inertial, source)
             self._check_mass(clean, inertial, source)
 
     def _check_inertia(self, inertial: Element, source: Element) -> None:
-        """Leave out an inertia of zeros, or with a part that cannot be read; make it symmetric."""
+        """Leave out an inertia of zeros, or with a part that cannot be read."""
         tensor, given = inertial.find("inertia"), source.find("inertia")
         if tensor is None or given is None:
             return
-        for below, above in MIRRORED.items():
-            if below not in tensor.attrib:
-                continue
-            one, other = float(tensor.attrib.pop(below)), float(tensor.get(above, 0.0))
-            if one != other:
-                tensor.set(above, repr((one + other) / 2))
-                text = f"{above} {other:g} and {below} {one:g} of <inertia> differ: their mean"
-                self.repair("inertia-asymmetric", text, given)
-        moments = GRAMMAR["inertia"].numbers.keys() - MIRRORED.keys()
-        if moments & given.attrib.keys() - tensor.attrib.keys():
+        if GRAMMAR["inertia"].numbers.keys() & given.attrib.keys() - tensor.attrib.keys():
             inertial.remove(tensor)
             self.repair("inertia-unreadable", "an <inertia> that cannot be read counts as none", given)
         elif not any(map(float, tensor.attrib.values())):

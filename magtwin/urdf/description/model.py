@@ -5,7 +5,7 @@ every link and joint with yourdfpy's.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from xml.etree import ElementTree
 
 import numpy as np
@@ -185,8 +185,6 @@ def read_joint(element: Element) -> Joint:
     axis, limit, dynamics, mimic = (element.find(t) for t in ("axis", "limit", "dynamics", "mimic"))
     assert parent is not None  # the names were checked
     assert child is not None
-    dynamics_values = None if dynamics is None else [_number(dynamics, n) for n in ("damping", "friction")]
-    limits = None if limit is None else [_number(limit, n) for n in ("effort", "velocity", "lower", "upper")]
     return Joint(
         name=element.attrib["name"],
         type=element.get("type", ""),
@@ -194,8 +192,10 @@ def read_joint(element: Element) -> Joint:
         child=child.attrib["link"],
         origin=read_origin(element.find("origin")),
         axis=np.array([1.0, 0.0, 0.0]) if axis is None else _numbers(axis, "xyz", "1 0 0"),
-        limit=None if limits is None else Limit(*limits),
-        dynamics=None if dynamics_values is None else Dynamics(*dynamics_values),
+        limit=None if limit is None else Limit(**{f.name: _number(limit, f.name) for f in fields(Limit)}),
+        dynamics=None
+        if dynamics is None
+        else Dynamics(**{f.name: _number(dynamics, f.name) for f in fields(Dynamics)}),
         mimic=None
         if mimic is None
         else Mimic(
@@ -258,12 +258,12 @@ def read_origin(element: Element | None) -> Array | None:
     """
     if element is None:
         return None
-    x, y, z = _numbers(element, "xyz", "0 0 0")
-    if "quat_xyzw" in element.attrib:
-        T, q = np.eye(4), _numbers(element, "quat_xyzw")
-        T[:3, :3], T[:3, 3] = matrix_from_quat(q / np.linalg.norm(q)), (x, y, z)
+    (x, y, z), rpy, q = origin_numbers(element)
+    if q is not None:
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = matrix_from_quat(q), (x, y, z)
         return T
-    (sr, sp, sy), (cr, cp, cy) = (turn(_numbers(element, "rpy", "0 0 0")) for turn in (np.sin, np.cos))
+    (sr, sp, sy), (cr, cp, cy) = np.sin(rpy), np.cos(rpy)
     return np.array(
         [
             [cp * cy, sp * (sr * cy) - cr * sy, sp * (cr * cy) + sr * sy, x],
@@ -272,6 +272,13 @@ def read_origin(element: Element | None) -> Array | None:
             [0.0, 0.0, 0.0, 1.0],
         ]
     )
+
+
+def origin_numbers(element: Element) -> tuple[Array, Array, Array | None]:
+    """Place [m]; roll, pitch and yaw [rad]; and unit quaternion xyzw, if one is given, of an `<origin>`."""
+    q = _numbers(element, "quat_xyzw") if "quat_xyzw" in element.attrib else None
+    xyz, rpy = _numbers(element, "xyz", "0 0 0"), _numbers(element, "rpy", "0 0 0")
+    return xyz, rpy, None if q is None else q / np.linalg.norm(q)
 
 
 def rpy_of(R: Array) -> tuple[float, float, float]:

@@ -2,13 +2,14 @@
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from xml.etree import ElementTree
 
 import numpy as np
 from pxr import Usd, Vt
 
 from magtwin.urdf.description.description import Description
+from magtwin.urdf.description.extensions import Figure
 from magtwin.urdf.description.vocabulary import Unused, unused
 from magtwin.urdf.source.markup import plain_text
 
@@ -35,6 +36,10 @@ class Tags:
     def blocks(self, tag: str) -> list[Element]:
         """Elements called `tag` directly below `<robot>`; marks them, but not their children."""
         return self.findall(self.description.xml, tag)
+
+    def have(self, tag: str) -> bool:
+        """Whether a `<gazebo>` has a tag."""
+        return any(block.find(tag) is not None for block in self.description.xml.findall("gazebo"))
 
     def find(self, element: Element | None, *paths: str) -> Element | None:
         """The first element at one of the paths below another, or None; marks it and its parents."""
@@ -98,6 +103,11 @@ class Tags:
             repair("number-range", f"{match.tag} {text} is not above {above:g}: not used", match)
             return None
         return value
+
+    def figures(self, element: Element, table: Mapping[str, Figure]) -> dict[str, float]:
+        """The numbers of a table that an element gives, by name."""
+        read = {n: self.number(element, *f.paths, least=f.least, above=f.above) for n, f in table.items()}
+        return {name: value for name, value in read.items() if value is not None}
 
     def nothing(self, element: Element | None, *paths: str) -> None:
         """Mark numbers that are 0, which have no effect; others stay unmarked."""

@@ -89,7 +89,7 @@ XYZ = Number(counts=(3,), vital=True)
 SIZE = Number(required=True, vital=True, signed=False)
 AMOUNT = Number(least=0.0)
 PLAIN, ENDLESS = Number(), Number(endless=True)
-MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz", "iyx", "izx", "izy")
+MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 GRAMMAR: Mapping[str, Entry] = {
     "robot": Entry(
@@ -100,7 +100,6 @@ GRAMMAR: Mapping[str, Entry] = {
     "link": Entry(
         "name",
         children="inertial visual collision",
-        moved="material",
         kept="@type contact self_collision_checking verbose",
     ),
     "inertial": Entry(children="origin mass inertia"),

@@ -50,7 +50,7 @@ LUMINANCE = (0.212671, 0.715160, 0.072169)
 """Weights of linear red, green and blue, from the specification."""
 
 
-def read_collada(reading: Reading) -> list[Piece]:
+def read(reading: Reading) -> list[Piece]:
     """The triangles of a COLLADA file, for `read_mesh`."""
     return _Collada(reading).pieces()
 

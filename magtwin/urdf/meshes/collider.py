@@ -1,16 +1,9 @@
-"""Collider: the solids of a mesh collider: its convex hull, convex parts, or the mesh itself."""
+"""Collider: the convex hull of a mesh, which collides in its place."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError
 from magtwin.urdf.meshes.mesh import Mesh, UnreadableMeshError, has_area
-from magtwin.urdf.options import Collision
-
-EXTRA = 'pip install "magtwin[decomposition]"'
-
-CONCAVITY = 0.05
-"""Largest depth of a hollow, relative to the mesh, that a convex part may fill (coacd's threshold)."""
 
 FLAT = 1e-13
 """Volume of a hull, relative to the cube of its longest side, that counts as none."""
@@ -23,33 +16,14 @@ PLATE = 0.005
 """Thickness of the plate that replaces a flat mesh, relative to the mesh's diagonal."""
 
 
-def solids_of(mesh: Mesh, collision: Collision) -> tuple[tuple[Solid, ...], float]:
-    """The solids of a mesh: one, or the parts of a convex decomposition.
+def solid_of(mesh: Mesh) -> tuple[Solid, float]:
+    """The hull of a mesh, its faces in a fixed order and none without an area.
 
-    The decomposition is coacd's (Wei et al. 2022, doi:10.1145/3528223.3530103). A hull has its faces in a
-    fixed order and none without an area. A flat mesh, which has no hull, is thickened to a plate.
+    A flat mesh, which has no hull, is thickened to a plate.
 
     Returns:
-        The solids; and the thickness of the plate in the unit of the file, 0 if the mesh is not flat.
-
-    Raises:
-        InputError: coacd is not installed, or finds no parts.
+        The solid; and the thickness of the plate in the unit of the file, 0 if the mesh is not flat.
     """
-    if collision == "mesh":
-        return ((mesh.points, mesh.faces),), 0.0
-    if collision == "decomposition":
-        try:
-            import coacd
-        except ImportError as error:
-            raise InputError(
-                f"a convex decomposition needs coacd, which is not installed: {EXTRA}"
-            ) from error
-        coacd.set_log_level("off")
-        whole = coacd.Mesh(mesh.points.astype(float), mesh.faces.astype(np.int32))
-        parts = coacd.run_coacd(whole, threshold=CONCAVITY, seed=0)
-        if not parts:
-            raise InputError(f"{mesh.path}: coacd finds no convex parts in it; use --collision hull")
-        return tuple((np.asarray(v, np.float32), np.asarray(f, np.int64)) for v, f in parts), 0.0
     points, thickness = mesh.points, 0.0
     faces = hull_faces(points.astype(float))
     if faces is None:
@@ -62,7 +36,7 @@ def solids_of(mesh: Mesh, collision: Collision) -> tuple[tuple[Solid, ...], floa
     faces = faces[np.lexsort(faces.T[::-1])]
     faces = faces[has_area(points, faces)]
     used = np.bincount(faces.ravel(), minlength=len(points)) > 0
-    return ((points[used], (np.cumsum(used) - 1)[faces]),), thickness
+    return (points[used], (np.cumsum(used) - 1)[faces]), thickness
 
 
 def _thickened(points: NDArray) -> tuple[NDArray[np.float32], float]:

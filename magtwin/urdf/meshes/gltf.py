@@ -46,7 +46,7 @@ SUPPORTED = ("KHR_materials_unlit", "KHR_mesh_quantization", "KHR_materials_emis
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
 
-def read_gltf(reading: Reading) -> list[Piece]:
+def read(reading: Reading) -> list[Piece]:
     """The triangles of a glTF file, turned to Z up, for `read_mesh`."""
     return _Gltf(reading).pieces()
 

@@ -1,7 +1,8 @@
 """Mesh: triangles of a mesh file with their normals, colours and textures, in metres."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,14 @@ from magtwin.urdf.meshes.reading import Images, Note, Reading
 from magtwin.urdf.source.markup import UnsafeError
 from magtwin.usd.solids import corner_normals
 
-SUFFIXES = (".dae", ".glb", ".gltf", ".obj", ".ply", ".stl")
-"""Formats that can be read."""
+READERS: Mapping[str, str] = {
+    ".dae": "collada",
+    ".glb": "gltf",
+    ".gltf": "gltf",
+    ".obj": "wavefront",
+    ".stl": "scan",
+}
+"""Module beside this one by suffix of the files that it reads, imported when first needed."""
 
 MOST_PAINTS = 10_000
 """Most materials of a mesh; in USD, their prims take time by their square."""
@@ -68,9 +75,6 @@ class Mesh:
         )
 
 
-Reader = Callable[[Reading], list[Piece]]
-
-
 def read_mesh(
     path: Path, may_read: Callable[[Path], bool] | None = None, images: Images | None = None
 ) -> Mesh:
@@ -93,7 +97,10 @@ def read_mesh(
     allowed = may_read or (lambda other: other.resolve().is_relative_to(folder))
     reading = Reading(existing_file(path, "mesh file", "mesh"), allowed, images or Images())
     try:
-        return _join(reading, _reader(path)(reading))
+        kind = READERS.get(path.suffix.lower())
+        if kind is None:
+            raise InputError(f"{path}: is of no known mesh format ({', '.join(READERS)})")
+        return _join(reading, import_module(f"magtwin.urdf.meshes.{kind}").read(reading))
     except UnsafeError:
         raise
     except InputError as error:
@@ -102,22 +109,6 @@ def read_mesh(
         reason = str(error).strip().splitlines() or [type(error).__name__]
         text = f"{path}: cannot be read as a mesh: {reason[0]}; export it again"
         raise UnreadableMeshError(text) from error
-
-
-def _reader(path: Path) -> Reader:
-    """The reader of a format, imported when first needed."""
-    match path.suffix.lower():
-        case ".dae":
-            from magtwin.urdf.meshes.collada import read_collada as reader
-        case ".glb" | ".gltf":
-            from magtwin.urdf.meshes.gltf import read_gltf as reader
-        case ".obj":
-            from magtwin.urdf.meshes.wavefront import read_wavefront as reader
-        case ".stl" | ".ply":
-            from magtwin.urdf.meshes.scan import read_scan as reader
-        case _:
-            raise InputError(f"{path}: is of no known mesh format ({', '.join(SUFFIXES)})")
-    return reader
 
 
 def _join(reading: Reading, pieces: Sequence[Piece]) -> Mesh:

@@ -6,7 +6,7 @@ The readable root layer references it, since large arrays do not belong in text.
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,26 +15,29 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 from magtwin.errors import InputError
 from magtwin.urdf.description.description import Description
 from magtwin.urdf.description.model import Geometry
-from magtwin.urdf.meshes.collider import Solid, solids_of
-from magtwin.urdf.meshes.mesh import SUFFIXES, Mesh, UnreadableMeshError, distinct, face_normals, read_mesh
+from magtwin.urdf.meshes.collider import solid_of
+from magtwin.urdf.meshes.mesh import READERS, Mesh, UnreadableMeshError, distinct, face_normals, read_mesh
 from magtwin.urdf.meshes.piece import PLAIN, Paint
 from magtwin.urdf.meshes.reading import Images
 from magtwin.urdf.meshes.texture import Textures
-from magtwin.urdf.options import DEFAULTS, Collision, Options
 from magtwin.urdf.source.package import MissingFileError
 from magtwin.usd import solids
+from magtwin.usd.attributes import read_number
 from magtwin.usd.layers import describe_stage
 from magtwin.usd.schema import place
 
-T = TypeVar("T")
-
 ROOT = Sdf.Path("/Meshes")
-
-FORMS: dict[Collision, str] = {"hull": "hull", "decomposition": "part", "mesh": "exact"}
-"""Suffix of a collider's prim by type."""
 
 MESH = "mesh"
 """Name of the mesh below a visual's prim."""
+
+KINDS = {
+    UsdGeom.Cube: "box",
+    UsdGeom.Capsule: "capsule",
+    UsdGeom.Cylinder: "cylinder",
+    UsdGeom.Sphere: "sphere",
+}
+"""URDF's primitives by USD's, which are along the same axis where the conversion authors them."""
 
 PRIMITIVE = "magtwin:primitive"
 """Custom data of a mesh that shows a primitive: its kind and measures [m]."""
@@ -59,14 +62,11 @@ class Entry:
 class MeshLayer:
     """A layer of meshes; visuals and colliders with the same file and scale share one."""
 
-    def __init__(
-        self, description: Description, options: Options = DEFAULTS, textures: str = "./textures"
-    ) -> None:
+    def __init__(self, description: Description, textures: str = "./textures") -> None:
         """Create an empty layer.
 
         Args:
             description: The description, which receives notes.
-            options: Type of mesh colliders, and treatment of missing meshes.
             textures: Asset path of the folder for textures, relative to the robot's layer.
         """
         self.textures = Textures(textures)
@@ -74,21 +74,19 @@ class MeshLayer:
         """Images of its meshes and of the URDF's materials."""
         self.looks: dict[tuple[Any, ...], Sdf.Path] = {}
         """Path of each material on the robot's stage by its name and values, see `material`."""
-        self._description, self.options = description, options
+        self._description = description
         self._stage = Usd.Stage.CreateInMemory()
         describe_stage(self._stage, f"{description.name}: triangles of its meshes.")
         self._stage.SetDefaultPrim(UsdGeom.Scope.Define(self._stage, ROOT).GetPrim())
         self.failed: dict[str, MissingFileError | UnreadableMeshError] = {}
         """Errors of the meshes that are missing or unreadable, by filename."""
-        self.flat: dict[str, float] = {}
-        """Thickness of the plates of flat colliders [m], by the file's name without folders."""
         self._names: set[str] = set()
         self._found: dict[str, Path] = {}
         self._files: dict[Path, Mesh] = {}
         self._visuals: dict[tuple[Path, tuple[float, ...]], Entry] = {}
         self._primitives: dict[tuple[Any, ...], Sdf.Path] = {}
-        self._colliders: dict[tuple[Path, tuple[float, ...]], tuple[Sdf.Path, ...]] = {}
-        self._solids: dict[Path, tuple[Solid, ...]] = {}
+        self._colliders: dict[tuple[Path, tuple[float, ...]], Sdf.Path] = {}
+        self._solids: dict[Path, tuple[NDArray, NDArray]] = {}
 
     def __len__(self) -> int:
         return len(self._visuals) + len(self._colliders) + len(self._primitives)
@@ -132,38 +130,22 @@ class MeshLayer:
             self._primitives[key] = mesh.GetPath()
         return self._primitives[key]
 
-    def collider(self, mesh: Geometry) -> tuple[Sdf.Path, ...]:
-        """The prims of a URDF `<mesh>` as a collider, several for a convex decomposition.
-
-        Raises as `visual` does.
-        """
+    def collider(self, mesh: Geometry) -> Sdf.Path:
+        """The hull of a URDF `<mesh>`; raises as `visual` does."""
         path, scale = self._file(mesh)
         key = (path, scale)
         if key not in self._colliders:
             if path not in self._solids:
-                self._solids[path], flat = solids_of(self._read(path), self.options.collision)
+                self._solids[path], flat = solid_of(self._read(path))
                 if flat:
-                    self.flat[mesh.filename.rpartition("/")[2]] = flat * max(map(abs, scale))
                     text = f"mesh {mesh.filename!r} is flat: it collides as a plate {flat:.2g} m thick"
                     self._description.repair("mesh-flat", text, self._description.mesh_element(mesh.filename))
-            made = []
-            for solid in self._solids[path]:
-                points, faces = _scaled(*solid, np.array(scale))
-                free = self._free(f"{path.stem}_{FORMS[self.options.collision]}")
-                normals = np.round(face_normals(points, faces), 4)
-                prim = self._define_mesh(free, points, faces)
-                _primvar(prim, "normals", Sdf.ValueTypeNames.Normal3fArray, normals, UsdGeom.Tokens.uniform)
-                made.append(free)
-            self._colliders[key] = tuple(made)
+            points, faces = _scaled(*self._solids[path], np.array(scale))
+            self._colliders[key] = self._free(f"{path.stem}_hull")
+            normals = np.round(face_normals(points, faces), 4)
+            prim = self._define_mesh(self._colliders[key], points, faces)
+            _primvar(prim, "normals", Sdf.ValueTypeNames.Normal3fArray, normals, UsdGeom.Tokens.uniform)
         return self._colliders[key]
-
-    def try_add(self, mesh: Geometry, add: Callable[[Geometry], T]) -> T | None:
-        """The result of `visual` or `collider`; None if the file is missing or unreadable, see `failed`."""
-        try:
-            return add(mesh)
-        except (MissingFileError, UnreadableMeshError) as error:
-            self.failed[mesh.filename] = error
-            return None
 
     def vertices(self, mesh: Geometry) -> NDArray[np.float64]:
         """Vertices of the file of an added `<mesh>`, scaled [m], shape (V, 3)."""
@@ -177,8 +159,8 @@ class MeshLayer:
     def _file(self, mesh: Geometry) -> tuple[Path, tuple[float, ...]]:
         """File and scale of a URDF `<mesh>`."""
         name, urdf = mesh.filename, self._description.path
-        if Path(name).suffix.lower() not in SUFFIXES:
-            raise UnreadableMeshError(f"{urdf}: mesh {name!r} is of no known format ({', '.join(SUFFIXES)})")
+        if Path(name).suffix.lower() not in READERS:
+            raise UnreadableMeshError(f"{urdf}: mesh {name!r} is of no known format ({', '.join(READERS)})")
         if name not in self._found:
             self._found[name] = self._description.find_file(name, "mesh")
         if not mesh.size.all():
@@ -241,7 +223,7 @@ class MeshLayer:
         return ROOT.AppendChild(free_name(Tf.MakeValidIdentifier(name), self._names))
 
 
-def gather(description: Description, options: Options, textures: str) -> MeshLayer:
+def gather(description: Description, textures: str) -> MeshLayer:
     """The layer of all meshes of a description; arguments as for `MeshLayer`.
 
     Meshes that are missing or unreadable are in its `failed`; see `placeholder`.
@@ -249,41 +231,39 @@ def gather(description: Description, options: Options, textures: str) -> MeshLay
     Raises:
         UnsafeError: The description may not read a mesh.
     """
-    meshes = MeshLayer(description, options, textures)
-    colliding = False
+    meshes = MeshLayer(description, textures)
     for link in description.links.values():
         for form in (visual.geometry for visual in link.visuals if visual.geometry.kind != "mesh"):
             meshes.primitive(form)
-        for role, shapes, add in (
-            ("visual", link.visuals, meshes.visual),
-            ("collision", link.collisions, meshes.collider),
-        ):
+        for shapes, add in ((link.visuals, meshes.visual), (link.collisions, meshes.collider)):
             for form in (shape.geometry for shape in shapes if shape.geometry.kind == "mesh"):
-                meshes.try_add(form, add)
-                colliding |= role == "collision"
-    if options.collision == "mesh" and colliding:
-        description.note(
-            "meshes collide as they are; PhysX does this for static bodies only, others become convex hulls"
-        )
+                try:
+                    add(form)
+                except (MissingFileError, UnreadableMeshError) as error:
+                    meshes.failed[form.filename] = error
     return meshes
 
 
 def primitive_of(prim: Usd.Prim) -> Geometry | None:
-    """The primitive that a mesh shows; None for other meshes.
+    """The primitive that a gprim is, or that a mesh shows; None for others.
 
     Raises:
-        InputError: The note that says so is damaged.
+        InputError: The note of a mesh that says so is damaged, or a size is none.
     """
     values = prim.GetCustomDataByKey(PRIMITIVE)
     if not values:
-        return None
+        kind = next((kind for schema, kind in KINDS.items() if prim.IsA(schema)), "")
+        if kind == "box":
+            return Geometry("box", np.full(3, read_number(prim, "size")))
+        length = read_number(prim, "height") if kind in ("capsule", "cylinder") else 0.0
+        return Geometry(kind, radius=read_number(prim, "radius"), length=length) if kind else None
     try:
         radius, length = (float(values.get(name, 0.0)) for name in ("radius", "length"))
         size = np.array(values.get("size", (1.0, 1.0, 1.0)), float)
         kind = str(values["kind"])
     except (AttributeError, KeyError, TypeError, ValueError):
         kind, size, radius, length = "", np.ones(3), 0.0, 0.0
-    if kind not in ("box", "capsule", "cylinder", "sphere") or size.shape != (3,):
+    if kind not in KINDS.values() or size.shape != (3,):
         raise InputError(f"{place(prim)}: its customData {PRIMITIVE} is damaged; remove it")
     return Geometry(kind, size, radius, length)
 

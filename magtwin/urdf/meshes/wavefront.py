@@ -59,7 +59,7 @@ class _Group:
     """Line of each polygon."""
 
 
-def read_wavefront(reading: Reading) -> list[Piece]:
+def read(reading: Reading) -> list[Piece]:
     """The triangles of a Wavefront OBJ, for `read_mesh`; vertices may have colours as in MeshLab."""
     path = reading.path
     rows: dict[str, list[str]] = {"v": [], "vt": [], "vn": []}

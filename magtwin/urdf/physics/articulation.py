@@ -1,9 +1,9 @@
 """Articulation: which prim is its root, and which of its bodies do not collide with each other."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
@@ -21,14 +21,8 @@ SELF_COLLISION = (
 OVERLAP_M = 0.001
 """Colliders whose convex hulls overlap by less can touch, such as the closed fingers of a gripper [m]."""
 
-NEAR = 1e-7
-"""Distance between two hulls, relative to their size, that counts as none."""
-
 COMPARED, POINTS = 20_000, 10_000
 """Most pairs of hulls that are compared; this many points count as one more pair."""
-
-ITERATIONS = 200
-"""Most steps of `_overlap`; hulls that take more are too near to tell."""
 
 
 def define_articulation(root: Usd.Prim, *, self_collision: bool) -> None:
@@ -50,7 +44,7 @@ def define_articulation(root: Usd.Prim, *, self_collision: bool) -> None:
 
 def filter_overlaps(
     bodies: Mapping[str, Usd.Prim], colliders: Mapping[str, Sequence[Usd.Prim]], joints: Sequence[Usd.Prim]
-) -> list[tuple[str, str]]:
+) -> None:
     """Author that bodies whose colliders overlap do not collide, since engines push such bodies apart.
 
     The hull of a bumper around a base, for example, contains the wheels. Colliders count as their convex
@@ -61,33 +55,27 @@ def filter_overlaps(
         colliders: Colliders of each body, in the same stage.
         joints: Prims of the joints.
 
-    Returns:
-        The pairs of link names.
-
     Raises:
         InputError: Too many colliders are in one place to compare them all.
     """
     left = COMPARED
     jointed = {frozenset(_ends(joint)) for joint in joints}
-    pairs = []
     for (first, second), near in _near(_hulls(bodies, colliders)).items():
         ends = bodies[first].GetPath(), bodies[second].GetPath()
         if frozenset(ends) in jointed:
             continue
         for a, b in near:
-            left -= 1 + (len(a) + len(b)) // POINTS
+            left -= 1 + (a.num_vert() + b.num_vert()) // POINTS
             if left < 0:
                 raise InputError(
                     f"link {first!r}: over {COMPARED:,} pairs of colliders are in one place; give its joints "
                     "origins, or merge colliders"
                 )
-            if _overlap(a, b):
+            if not (a ^ b).is_empty():
                 break
         else:
             continue
         UsdPhysics.FilteredPairsAPI.Apply(bodies[first]).CreateFilteredPairsRel().AddTarget(ends[1])
-        pairs.append((first, second))
-    return pairs
 
 
 def _ends(joint: Usd.Prim) -> list[Sdf.Path]:
@@ -98,9 +86,11 @@ def _ends(joint: Usd.Prim) -> list[Sdf.Path]:
 
 def _hulls(
     bodies: Mapping[str, Usd.Prim], colliders: Mapping[str, Sequence[Usd.Prim]]
-) -> dict[str, list[NDArray[np.float64]]]:
-    """Points of each collider of each body, shrunk by half of `OVERLAP_M`, shape (N, 3)."""
-    hulls: dict[str, list[NDArray[np.float64]]] = {name: [] for name in bodies}
+) -> dict[str, list[Any]]:
+    """Hull of each collider of each body, shrunk by half of `OVERLAP_M`; thinner ones are empty."""
+    from manifold3d import Manifold
+
+    hulls: dict[str, list[Any]] = {name: [] for name in bodies}
     if not bodies:
         return hulls
     owner = {prim.GetPath(): name for name, prims in colliders.items() for prim in prims}
@@ -115,19 +105,18 @@ def _hulls(
         away = points - points.mean(axis=0)
         far = np.linalg.norm(away, axis=1, keepdims=True)
         shrunk = points - away * np.minimum(1.0, OVERLAP_M / 2 / np.maximum(far, 1e-12))
-        hulls[owner[path]].append(shrunk)
+        hulls[owner[path]].append(Manifold.hull_points(np.ascontiguousarray(shrunk)))
     return hulls
 
 
-def _near(
-    hulls: Mapping[str, Sequence[NDArray]],
-) -> dict[tuple[str, str], list[tuple[NDArray, NDArray]]]:
+def _near(hulls: Mapping[str, Sequence[Any]]) -> dict[tuple[str, str], list[tuple[Any, Any]]]:
     """Hulls of different bodies whose boxes meet, by pair of bodies, in the order of the bodies."""
     owner = [name for name, some in hulls.items() for _ in some]
-    whole = [points for some in hulls.values() for points in some]
-    low, high = (np.array([f(points, axis=0) for points in whole]).reshape(-1, 3) for f in (np.min, np.max))
+    whole = [hull for some in hulls.values() for hull in some]
+    boxes = np.array([hull.bounding_box() for hull in whole]).reshape(-1, 6)
+    low, high = boxes[:, :3], boxes[:, 3:]
     ends = dict(zip(hulls, np.cumsum([len(some) for some in hulls.values()]), strict=True))
-    near: dict[tuple[str, str], list[tuple[NDArray, NDArray]]] = {}
+    near: dict[tuple[str, str], list[tuple[Any, Any]]] = {}
     for i, name in enumerate(owner):
         end = ends[name]
         meets = ((low[end:] <= high[i]) & (low[i] <= high[end:])).all(axis=1)
@@ -135,46 +124,3 @@ def _near(
             near.setdefault((name, owner[j]), []).append((whole[i], whole[j]))
     order = {name: k for k, name in enumerate(hulls)}
     return {pair: near[pair] for pair in sorted(near, key=lambda pair: (order[pair[0]], order[pair[1]]))}
-
-
-def _overlap(a: NDArray, b: NDArray) -> bool:
-    """Whether the convex hulls of points (N, 3) and (M, 3) have a point in common.
-
-    They do if and only if the hull of all differences p - q contains the origin. Its point nearest to the
-    origin is found with Wolfe's algorithm (1976, doi:10.1007/BF01580381), which needs only the differences
-    that are farthest along a direction.
-    """
-    if np.any(a.min(axis=0) > b.max(axis=0)) or np.any(b.min(axis=0) > a.max(axis=0)):
-        return False
-    size = float(np.abs(a).max() + np.abs(b).max())
-    corral = np.array([a[0] - b[0]])
-    weights = np.ones(1)
-    x = corral[0]
-    for _ in range(ITERATIONS):
-        new = a[np.argmin(a @ x)] - b[np.argmax(b @ x)]
-        if new @ x > 0:
-            return False  # the plane across x lies between them
-        if x @ x < (NEAR * size) ** 2 or x @ x - new @ x < NEAR**2 * size**2:
-            return True
-        corral, weights = np.vstack([corral, new]), np.append(weights, 0.0)
-        while True:  # drop points until the nearest point of the plane through the rest lies between them
-            wanted = _nearest(corral)
-            if (wanted > 0).all():
-                weights = wanted
-                break
-            low = wanted <= 0
-            step = np.min(weights[low] / np.maximum(weights[low] - wanted[low], 1e-300))
-            weights = weights + min(step, 1.0) * (wanted - weights)
-            kept = weights > 1e-12
-            kept[np.flatnonzero(low)[np.argmin(weights[low])]] = False
-            corral, weights = corral[kept], weights[kept] / weights[kept].sum()
-        x = weights @ corral
-    return True
-
-
-def _nearest(points: NDArray) -> NDArray[np.float64]:
-    """Weights with sum 1 of points (N, 3), of which the sum is nearest to the origin; may be below 0."""
-    n = len(points)
-    system = np.ones((n + 1, n + 1))
-    system[:n, :n], system[n, n] = points @ points.T, 0
-    return np.linalg.lstsq(system, np.append(np.zeros(n), 1.0), rcond=None)[0][:n]

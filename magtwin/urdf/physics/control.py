@@ -1,22 +1,17 @@
 """Control: the mobile base and the commands of a robot, from plugins, controllers and `<transmission>`."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from pxr import Usd
-
 from magtwin.errors import InputError
-from magtwin.spec.drive import DriveSpec
+from magtwin.urdf.description.extensions import MODULES
 from magtwin.urdf.description.tag import Tags
 from magtwin.urdf.options import DriveRule
-from magtwin.urdf.physics.controller import base_of_plugin_settings, base_of_settings
 from magtwin.urdf.physics.drive import POSITION_STIFFNESS, WHEEL_DAMPING, holds_position, own_gain
 from magtwin.urdf.physics.mechanism import SINGLE, Mechanism
 from magtwin.urdf.physics.mobile_base import MobileBase
-from magtwin.urdf.physics.plugin import base_of_plugin
-from magtwin.usd.sensors import JOINT_FIELDS, WHEELS_FIELDS, define_drive
 
 COMMANDS = {"velocity": "velocity", "position": "position", "effort": "none"}
 """Type of drive by command interface; effort on a continuous joint needs none: the torque is from outside."""
@@ -33,9 +28,14 @@ def read_base(tags: Tags, controllers: Path | None = None) -> MobileBase | None:
         InputError: The file of `controllers` names an unknown joint, has an invalid number, or has no
             controller that drives wheels.
     """
+    if controllers is None and not tags.have("plugin"):
+        return None
+    controller: Any = import_module(MODULES["plugin"])
+    base: MobileBase | None
     if controllers is None:
-        return base_of_plugin(tags) or base_of_plugin_settings(tags)
-    base = base_of_settings(tags, controllers)
+        base = controller.base_of_plugin(tags) or controller.base_of_plugin_settings(tags)
+        return base
+    base = controller.base_of_settings(tags, controllers)
     if base is None:
         raise InputError(f"{controllers}: has no controller of a mobile base", parameter="controllers")
     return base
@@ -69,20 +69,6 @@ def read_commands(tags: Tags, mechanism: Mechanism) -> tuple[DriveRule, ...]:
         pattern = "".join(f"[{c}]" if c in "*?[" else c for c in name)  # matches this name only
         rules[name] = DriveRule(joints=pattern, type=kind, **gains)  # type: ignore[arg-type]
     return tuple(rules.values())
-
-
-def define_differential(robot: Usd.Prim, spec: DriveSpec, prim_names: Mapping[str, str]) -> Usd.Prim:
-    """Author a drive on the robot's prim.
-
-    Args:
-        robot: Its joints exist already.
-        spec: The drive, with the joint names of the URDF.
-        prim_names: Joint names in USD by their URDF names.
-    """
-    named: dict[str, Any] = {f: prim_names.get(getattr(spec, f), getattr(spec, f)) for f in JOINT_FIELDS}
-    for field in WHEELS_FIELDS:
-        named[field] = tuple(prim_names.get(name, name) for name in getattr(spec, field))
-    return define_drive(robot, replace(spec, **named))
 
 
 def _commands(tags: Tags) -> Iterator[tuple[str, list[str]]]:

@@ -111,9 +111,6 @@ def define_drive(
         mechanism: Joints of the description, which receives notes.
         options: Rules and profile.
         wheels: Driven wheels.
-
-    Raises:
-        InputError: The URDF's effort is below 0; the message gives the line.
     """
     rule = _rule(joint, options)
     if joint.name in mechanism.mimics or (joint.type not in SINGLE and rule is None):
@@ -229,8 +226,6 @@ def _effort(joint: Joint, default: float, description: Description) -> float:
             f"its drive may use {default:g} {'N' if joint.type == 'prismatic' else 'N m'}"
         )
         return default
-    if not effort > 0:
-        raise description.refused("joint", joint.name, f"has an effort of {effort:g}; give one above 0")
     return float(effort)
 
 

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pxr import Usd, UsdGeom
 
+from magtwin.field.sources.moments import mesh_moments
 from magtwin.frames import canonical
 from magtwin.urdf.meshes.collider import hull_faces
 from magtwin.urdf.meshes.mesh_layer import primitive_of
-from magtwin.usd.attributes import read_number
 
 ROUNDING = 1e-6
 """Relative excess of the largest moment over the sum of the others that single precision can cause."""
@@ -173,8 +173,6 @@ def polyhedron(points: NDArray, faces: NDArray) -> MassProperties:
         points: Corners [m], shape (V, 3).
         faces: Triangles, counter-clockwise from outside, shape (F, 3).
     """
-    from magtwin.field.sources.bodies import mesh_moments  # not needed by most robots
-
     volume, centre, spread = mesh_moments(points, faces)
     return MassProperties(volume, centre, volume * (np.trace(spread) * np.eye(3) - spread))
 
@@ -219,25 +217,15 @@ def read_solid(prims: Iterable[Usd.Prim], frame: Usd.Prim) -> MassProperties | N
 def _read_gprim(prim: Usd.Prim, T: NDArray) -> MassProperties | None:
     """The solid of a gprim with pose T, shape (4, 4); boxes and meshes may be scaled."""
     form = primitive_of(prim)
-    if form is None and prim.IsA(UsdGeom.Mesh):
-        return _read_mesh(UsdGeom.Mesh(prim), T)
+    if form is None:
+        return _read_mesh(UsdGeom.Mesh(prim), T) if prim.IsA(UsdGeom.Mesh) else None
     scale = np.linalg.norm(T[:3, :3], axis=0)
     T = T @ np.diag([*1 / scale, 1])
-    if form is not None:
-        match form.kind:
-            case "box":
-                return box(scale * form.size).moved(T)
-            case "sphere":
-                return sphere(form.radius).moved(T)
-        return (cylinder if form.kind == "cylinder" else capsule)(form.radius, form.length).moved(T)
-    if prim.IsA(UsdGeom.Cube):
-        return box(scale * read_number(prim, "size")).moved(T)
-    if prim.IsA(UsdGeom.Sphere):
-        return sphere(read_number(prim, "radius")).moved(T)
-    for schema, shape in ((UsdGeom.Cylinder, cylinder), (UsdGeom.Capsule, capsule)):
-        if prim.IsA(schema):  # along z, as the conversion authors them
-            return shape(read_number(prim, "radius"), read_number(prim, "height")).moved(T)
-    return None
+    if form.kind == "box":
+        return box(scale * form.size).moved(T)
+    if form.kind == "sphere":
+        return sphere(form.radius).moved(T)
+    return (cylinder if form.kind == "cylinder" else capsule)(form.radius, form.length).moved(T)
 
 
 def _read_mesh(mesh: UsdGeom.Mesh, T: NDArray) -> MassProperties | None:

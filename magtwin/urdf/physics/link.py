@@ -51,25 +51,23 @@ def is_marker(link: Link) -> bool:
     return link.inertial is None and not link.visuals and not link.collisions
 
 
-def define_body(
-    prim: Usd.Prim, parts: Sequence[Rider], description: Description, density: float | None = None
-) -> Usd.Prim:
+def define_body(prim: Usd.Prim, parts: Sequence[Rider], description: Description) -> None:
     """Make an Xform a rigid body with the total mass, centre and principal inertia of its links.
+
+    A body of links without mass gets that of its colliders at `WATER`, as engines compute it, or else
+    `MASSLESS_KG`.
 
     Args:
         prim: The Xform, with its shapes below it.
         parts: The body's own link, and links merged into it.
         description: Receives notes of repairs and guesses.
-        density: Density of links without mass [kg/m3]. None leaves them without; a body of such links gets
-            the mass of its colliders at `WATER`, as engines compute it, or else `MASSLESS_KG`.
     """
     prim.AddAppliedSchema(LINK_API)
     UsdPhysics.RigidBodyAPI.Apply(prim).CreateRigidBodyEnabledAttr(True)
     parts = [part for part in parts if part is parts[0] or not is_marker(part.link)]
-    properties = [_mass_properties(part, prim, description, density) for part in parts]
-    known = [each for each in properties if each is not None]
+    known = [_mass_properties(part, prim, description) for part in parts if part.link.inertial is not None]
     if not known:
-        filled = (_from_shapes(part, prim, description, WATER) for part in parts if part.colliders)
+        filled = (_filled(part, prim, description) for part in parts if part.colliders)
         known = [each for each in filled if each is not None] or [_massless(parts[0], prim, description)]
     whole = known[0] if len(known) == 1 else combined(known)
     mass = UsdPhysics.MassAPI.Apply(prim)
@@ -80,7 +78,6 @@ def define_body(
     moments, q = principal_axes(tensor)
     mass.CreateDiagonalInertiaAttr(_single(moments, turned=abs(q[3]) < 1))
     mass.CreatePrincipalAxesAttr(Gf.Quatf(*(round(float(v), 7) + 0.0 for v in wxyz_from_xyzw(q))))
-    return prim
 
 
 def _single(moments: NDArray, *, turned: bool) -> Gf.Vec3f:
@@ -98,13 +95,10 @@ def _single(moments: NDArray, *, turned: bool) -> Gf.Vec3f:
     return Gf.Vec3f(*map(float, rounded))
 
 
-def _mass_properties(
-    part: Rider, body: Usd.Prim, description: Description, density: float | None
-) -> MassProperties | None:
-    """Mass properties of a link in its body's frame; None if unknown."""
+def _mass_properties(part: Rider, body: Usd.Prim, description: Description) -> MassProperties:
+    """Mass properties of a link with an `<inertial>` in its body's frame."""
     link, inertial = part.link, part.link.inertial
-    if inertial is None:
-        return _from_shapes(part, body, description, density)
+    assert inertial is not None
     assert inertial.mass is not None  # the grammar leaves out an <inertial> without one
     mass, centre = float(inertial.mass), (part.pose @ origin_of(inertial))[:3, 3]
     about, start = ("link", link.name), f"link {link.name!r}"
@@ -135,22 +129,14 @@ def _massless(part: Rider, body: Usd.Prim, description: Description) -> MassProp
     return MassProperties(kg, solid.centre, kg / solid.mass * solid.inertia)
 
 
-def _from_shapes(
-    part: Rider, body: Usd.Prim, description: Description, density: float | None
-) -> MassProperties | None:
-    """Mass properties of a link without `<inertial>`: its shapes at a density, if one is given."""
-    name = part.link.name
-    if density is None:
-        return None
-    used, solid = "colliders", read_solid(part.colliders, body)
+def _filled(part: Rider, body: Usd.Prim, description: Description) -> MassProperties | None:
+    """Mass properties of the colliders of a link without `<inertial>` at the density of water."""
+    solid = read_solid(part.colliders, body)
     if solid is None:
-        used, solid = "visuals", read_solid(part.visuals, body)
-    if solid is None:
-        description.note(f"link {name!r} has no <inertial> and no shape to fill: it has no mass")
         return None
-    mass = density * solid.mass
-    description.note(f"link {name!r} has no <inertial>: {mass:.3g} kg, its {used} at {density:g} kg/m3")
-    return MassProperties(mass, solid.centre, density * solid.inertia)
+    mass, name = WATER * solid.mass, part.link.name
+    description.note(f"link {name!r} has no <inertial>: {mass:.3g} kg, its colliders at {WATER:g} kg/m3")
+    return MassProperties(mass, solid.centre, WATER * solid.inertia)
 
 
 def _turned(inertia: NDArray, origin: NDArray) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ WORLD = ""
 """Name of the world, which is not a body; joints to it hold the robot at its prim's frame."""
 
 
-def place_links(mechanism: Mechanism, *, merge: bool = False, filled: bool = False) -> dict[str, Place]:
+def place_links(mechanism: Mechanism, *, merge: bool = False) -> dict[str, Place]:
     """The body that each link is or rides on, with its pose in it; parents before children.
 
     Links that are only frames ride on the nearest body above; those above the first body, such as
@@ -34,10 +34,9 @@ def place_links(mechanism: Mechanism, *, merge: bool = False, filled: bool = Fal
         mechanism: Joints of the description, which receives notes.
         merge: Whether links with mass or shape that cannot move also ride on the body above, except those
             whose joint has `dont_collapse`.
-        filled: Whether links without mass get one from a density, so that they stay bodies.
     """
     description = mechanism.description
-    taken = {} if merge or filled else _taken_over(mechanism)
+    taken = {} if merge else _taken_over(mechanism)
     base, above = _base(mechanism)
     poses = mechanism.poses()
     home = np.eye(4) if base == WORLD else poses[base]
@@ -49,7 +48,7 @@ def place_links(mechanism: Mechanism, *, merge: bool = False, filled: bool = Fal
             continue
         joint = description.joints[name]
         body, pose = places[joint.parent]
-        massless = link.inertial is None and not filled
+        massless = link.inertial is None
         joins = body != WORLD and not joint.own_body and (merge or massless or name in taken)
         if joint.name in mechanism.welded and (joins or is_marker(link)):
             places[name] = (body, pose @ mechanism.pose(joint))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.spec.drive import DriveSpec
-from magtwin.urdf.description.tag import Element
+from magtwin.urdf.description.tag import Element, Tags
 from magtwin.urdf.physics.mechanism import Mechanism
 
 Kind = Literal["differential", "skid-steer", "mecanum", "holonomic", "car"]
@@ -34,21 +34,13 @@ DRIVEN_AS: Mapping[str, str] = {
 }
 """What the simulator makes of each kind."""
 
-NAMES = {
-    "wheel_separation_m": "wheel separation",
-    "wheel_radius_m": "wheel radius",
-    "wheel_rate_max": "highest wheel rate",
-    "v_max": "highest speed",
-    "w_max": "highest yaw rate",
-    "turning_radius_m": "turning radius",
-}
-UNITS = {
-    "wheel_separation_m": "m",
-    "wheel_radius_m": "m",
-    "wheel_rate_max": "rad/s",
-    "v_max": "m/s",
-    "w_max": "rad/s",
-    "turning_radius_m": "m",
+FIGURES = {
+    "wheel_separation_m": ("wheel separation", "m"),
+    "wheel_radius_m": ("wheel radius", "m"),
+    "wheel_rate_max": ("highest wheel rate", "rad/s"),
+    "v_max": ("highest speed", "m/s"),
+    "w_max": ("highest yaw rate", "rad/s"),
+    "turning_radius_m": ("turning radius", "m"),
 }
 """Names and units of figures in notes."""
 
@@ -115,60 +107,7 @@ def drive_spec(base: MobileBase, mechanism: Mechanism, radius_of: Callable[[str]
     wrong = {name for name, axis in zip(base.wheels, axes, strict=True) if axis[1] < 0}
     for note in backward([name for name in (*left, *right) if name in wrong]):
         description.note(note)
-    given: dict[str, Any] = dict(base.figures)
-
-    def guess(name: str, value: float | None, how: str) -> None:
-        if name not in given and value is not None and 0 < value < np.inf:
-            given[name] = float(value)
-            description.note(f"drive: {NAMES[name]} {value:.5g} {UNITS[name]}, {how}")
-
-    gap = abs(places[left[0]][1] - places[right[0]][1])
-    if base.kind == "mecanum" and "wheel_separation_m" not in given:
-        along = [place[0] for place in places.values()]
-        guess(
-            "wheel_separation_m",
-            gap + max(along) - min(along),
-            "not given: the sum of both distances between wheel joints",
-        )
-    times = base.separation_multiplier
-    scaled = "" if times == 1 else f", times the multiplier {times:g}"
-    guess("wheel_separation_m", times * gap, f"not given: the distance between the wheel joints{scaled}")
-    radii = [radius for name in (left[0], right[0]) if (radius := radius_of(name)) > 0]
-    guess("wheel_radius_m", sum(radii) / len(radii) if radii else None, "not given: from the wheels' shape")
-    limit = joints[left[0]].limit
-    rate = None if limit is None or not limit.velocity else float(limit.velocity)
-    radius = given.get("wheel_radius_m", DriveSpec.wheel_radius_m)
-    separation = given.get("wheel_separation_m", DriveSpec.wheel_separation_m)
-    guess("wheel_rate_max", rate, "from the wheel joint's limit")
-    guess("v_max", None if rate is None else rate * radius, "from the wheel joint's limit")
-    if base.kind == "car":
-        tightest = _turning_radius(base, mechanism)
-        if tightest is None:
-            description.note(
-                "drive: the steering angle has no limit, so that the turning radius is not limited"
-            )
-        guess("turning_radius_m", tightest, "from the wheelbase and the steering angle")
-        if "v_max" in given and "turning_radius_m" in given:
-            guess(
-                "w_max",
-                given["v_max"] / given["turning_radius_m"],
-                "the highest speed over the turning radius",
-            )
-    elif "v_max" in given:
-        guess(
-            "w_max",
-            2 * given["v_max"] / separation,
-            "with the wheels at the highest speed in opposite directions",
-        )
-    if "v_max" in given:
-        least = given["v_max"] / radius
-        if "wheel_rate_max" not in given:
-            turning = given.get("w_max", DriveSpec.w_max) * separation / 2 / radius
-            guess("wheel_rate_max", least + turning, "for the highest speed and yaw rate at once")
-    default = ("wheel_separation_m", "wheel_radius_m", "v_max", "w_max", "a_max", "alpha_max")
-    unknown = [f"{name} {getattr(DriveSpec, name):g}" for name in default if name not in given]
-    if unknown:
-        description.note(f"drive: TurtleBot 4's values are used for {', '.join(unknown)}")
+    given = _figures(base, mechanism, left, right, radius_of)
     kind = "" if base.kind == "differential" else f" ({base.kind})"
     description.note(f"drive from {base.source}{kind}: simulated as {DRIVEN_AS[base.kind]}")
     try:
@@ -181,6 +120,68 @@ def drive_spec(base: MobileBase, mechanism: Mechanism, radius_of: Callable[[str]
         )
     except InputError as error:
         raise InputError(f"{base.source}: {error}") from error
+
+
+def _figures(
+    base: MobileBase,
+    mechanism: Mechanism,
+    left: list[str],
+    right: list[str],
+    radius_of: Callable[[str], float],
+) -> dict[str, Any]:
+    """The figures of a drive: those given, and those measured on the robot, with notes."""
+    description, poses = mechanism.description, mechanism.poses()
+    joints = {joint.name: joint for joint in description.joints.values()}
+    places = {name: poses[joints[name].child][:3, 3] for name in base.wheels}
+    given: dict[str, Any] = dict(base.figures)
+
+    def guess(name: str, value: float | None, how: str) -> None:
+        if name not in given and value is not None and 0 < value < np.inf:
+            given[name] = float(value)
+            what, unit = FIGURES[name]
+            description.note(f"drive: {what} {value:.5g} {unit}, {how}")
+
+    gap = abs(places[left[0]][1] - places[right[0]][1])
+    if base.kind == "mecanum":
+        reach = float(np.ptp([place[0] for place in places.values()]))
+        how = "not given: the sum of both distances between wheel joints"
+        guess("wheel_separation_m", gap + reach, how)
+    times = base.separation_multiplier
+    scaled = "" if times == 1 else f", times the multiplier {times:g}"
+    guess("wheel_separation_m", times * gap, f"not given: the distance between the wheel joints{scaled}")
+    radii = [radius for name in (left[0], right[0]) if (radius := radius_of(name)) > 0]
+    guess("wheel_radius_m", sum(radii) / len(radii) if radii else None, "not given: from the wheels' shape")
+    limit = joints[left[0]].limit
+    rate = None if limit is None or not limit.velocity else float(limit.velocity)
+    radius = given.get("wheel_radius_m", DriveSpec.wheel_radius_m)
+    separation = given.get("wheel_separation_m", DriveSpec.wheel_separation_m)
+    guess("wheel_rate_max", rate, "from the wheel joint's limit")
+    guess("v_max", None if rate is None else rate * radius, "from the wheel joint's limit")
+    v = given.get("v_max", np.nan)
+    if base.kind == "car":
+        tightest = _turning_radius(base, mechanism)
+        if tightest is None:
+            text = "drive: the steering angle has no limit, so that the turning radius is not limited"
+            description.note(text)
+        guess("turning_radius_m", tightest, "from the wheelbase and the steering angle")
+        around = given.get("turning_radius_m", np.nan)
+        guess("w_max", v / around, "the highest speed over the turning radius")
+    else:
+        guess("w_max", 2 * v / separation, "with the wheels at the highest speed in opposite directions")
+    turning = given.get("w_max", DriveSpec.w_max) * separation / 2 / radius
+    guess("wheel_rate_max", v / radius + turning, "for the highest speed and yaw rate at once")
+    default = ("wheel_separation_m", "wheel_radius_m", "v_max", "w_max", "a_max", "alpha_max")
+    unknown = [f"{name} {getattr(DriveSpec, name):g}" for name in default if name not in given]
+    if unknown:
+        description.note(f"drive: TurtleBot 4's values are used for {', '.join(unknown)}")
+    return given
+
+
+def leave_out(tags: Tags, element: Element | None, error: InputError) -> None:
+    """Report a drive that cannot be used, and let its tag be kept as text."""
+    tags.description.repair("drive-incomplete", f"{error}: the drive is kept as text", element)
+    if element is not None:
+        tags.forget(element)
 
 
 def backward(joints: list[str]) -> list[str]:

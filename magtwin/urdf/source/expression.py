@@ -71,6 +71,14 @@ def _sum(values: Any, start: float = 0) -> float:
     return sum(values)
 
 
+class _Set(list[Any]):
+    """A set in a fixed order, so that output is reproducible."""
+
+    def __sub__(self, other: Any) -> "_Set":
+        left_out = dict.fromkeys(other)
+        return _Set(value for value in self if value not in left_out)
+
+
 _UNBOUNDED = ("factorial", "comb", "perm", "prod", "lcm")
 
 MATH = {name: f for name, f in vars(math).items() if not name.startswith("_") and name not in _UNBOUNDED}
@@ -82,12 +90,12 @@ PYTHON: Mapping[str, Any] = {
     **{f.__name__: lambda *a, f=f, **b: list(f(*a, **b)) for f in (enumerate, filter, map, reversed, zip)},
     "range": _range,
     "round": _round,
-    "set": lambda values=(): list(dict.fromkeys(values)),  # in a fixed order, so that output is reproducible
+    "set": lambda values=(): _Set(dict.fromkeys(values)),
     "sum": _sum,
     "isinstance": isinstance,
 }
 
-_BARE = (bool, dict, float, int, len, list, map, max, min, range, round, sorted, str)
+_BARE = (bool, dict, float, int, len, list, map, max, min, range, round, set, sorted, str)
 
 GLOBALS: Mapping[str, Any] = {
     **MATH,
@@ -340,6 +348,8 @@ class _Interpreter:
             for values, times in ((left, right), (right, left)):
                 if isinstance(values, str | list | tuple) and isinstance(times, int):
                     _check_length(len(values) * times)
+        if isinstance(left, _Set):  # paid for before they are compared
+            check_size([left, right], self._budget)
         integers = isinstance(left, int) and isinstance(right, int)
         if isinstance(kind, ast.Pow) and integers and left.bit_length() * abs(right) > BITS:
             raise ExpressionError(f"an integer of over {BITS} bits")

@@ -16,9 +16,6 @@ from magtwin.files.file import read_bytes
 _LONGEST_TAG = re.compile(rb"<[^<>]{%d}" % (1 << 20))
 """An element of over a million characters of attributes, which expat holds all at once."""
 
-_LATE = re.compile(rb"\A(\s+)(<\?xml\b[^>]*>)")
-"""Blanks before the XML declaration, which must be first."""
-
 
 BLOCK = 1 << 16
 """Characters of a text that are worked on at once."""
@@ -40,9 +37,6 @@ class Markup:
     lines: dict[ElementTree.Element, int]
     """In the order of the file."""
 
-    late: int = 0
-    """Line of an XML declaration below blank lines, 0 if it is first."""
-
 
 def read_markup(path: Path, what: str) -> Markup:
     """Read an XML file.
@@ -58,19 +52,8 @@ def read_markup(path: Path, what: str) -> Markup:
     return parse_markup(read_bytes(path, what, "XML"), path)
 
 
-def in_order(text: bytes) -> bytes:
-    """An XML text whose declaration is first, with its blank lines below it, so that lines keep numbers."""
-    return _LATE.sub(rb"\2\1", text)
-
-
 def parse_markup(text: bytes, path: Path) -> Markup:
-    """Elements of an XML text read from `path`; errors as for `read_markup`.
-
-    An XML declaration below blank lines is read as if it were first.
-    """
-    blank = _LATE.match(text)
-    late = 1 + blank[1].count(b"\n") if blank else 0
-    text = in_order(text)
+    """Elements of an XML text read from `path`; errors as for `read_markup`."""
     builder, depth, count = ElementTree.TreeBuilder(), 0, 0
     lines: dict[ElementTree.Element, int] = {}
     most_levels, most_elements = BUDGETS["XML"].depth, BUDGETS["XML"].count
@@ -119,7 +102,7 @@ def parse_markup(text: bytes, path: Path) -> Markup:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}:1: not XML: {error}; save the file as UTF-8") from error
-    return Markup(builder.close(), lines, late)
+    return Markup(builder.close(), lines)
 
 
 def plain_text(element: ElementTree.Element) -> str:

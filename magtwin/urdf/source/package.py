@@ -43,11 +43,10 @@ class Packages:
     The search order is: given packages; packages above the file, by their `package.xml`; packages beside
     those, down to DEPTH folders below (below the file's folder if no package contains the file); a folder
     of that name that contains the file or lies beside it or a parent, at most DEPTH levels up; last, the
-    packages of ROS: `share/NAME` below each folder of AMENT_PREFIX_PATH, then the `package.xml` at most
-    DEPTH folders below each folder of ROS_PACKAGE_PATH. A folder found by its name alone must look like a
-    package (see MARKS), because the description chooses the name: `package://home` must not lead to a home
-    folder. Of the packages of ROS, only those that the description names are read. Nothing is executed,
-    and symbolic links around the file are not followed.
+    packages of ROS: `share/NAME` below each folder of AMENT_PREFIX_PATH. A folder found by its name alone
+    must look like a package (see MARKS), because the description chooses the name: `package://home` must not
+    lead to a home folder. Of the packages of ROS, only those that the description names are read. Nothing is
+    executed, and symbolic links around the file are not followed.
     """
 
     def __init__(self, given: Mapping[str, Path], file: Path) -> None:
@@ -142,25 +141,12 @@ def _add(folder: Path, found: dict[str, list[Path]]) -> None:
 
 
 def _installed(name: str) -> Path | None:
-    """Folder of a package of ROS in AMENT_PREFIX_PATH or ROS_PACKAGE_PATH; None if there is none."""
+    """Folder of a package of ROS in AMENT_PREFIX_PATH; None if there is none."""
     if not name or Path(name).name != name:
         return None
-    prefixes, workspaces = (
-        [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
-        for variable in ("AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH")
-    )
-    for folder in (prefix / "share" / name for prefix in prefixes):
-        if _has_manifest(folder):
-            return folder.resolve()
-    left = FOLDERS
-    for workspace in workspaces:
-        for folder in (workspace, *_below(workspace, DEPTH)):
-            left -= 1
-            if left < 0:
-                return None
-            if folder.name == name and _has_manifest(folder):
-                return folder.resolve()
-    return None
+    prefixes = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))
+    folders = (Path(prefix) / "share" / name for prefix in prefixes)
+    return next((folder.resolve() for folder in folders if _has_manifest(folder)), None)
 
 
 def _has_manifest(folder: Path) -> bool:

@@ -4,15 +4,19 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from xml.etree import ElementTree
 
 from magtwin.errors import InputError, near
 from magtwin.files.file import existing
-from magtwin.urdf.repairs import DECLARATION_LATE, Repairs
+from magtwin.urdf.repairs import Repairs
 from magtwin.urdf.source.markup import UnsafeError, read_markup
 from magtwin.urdf.source.package import MissingFileError, Packages
+
+EXPANDER = "magtwin.urdf.source.xacro"
+"""Module of macros, with its interpreter, which a plain URDF does not need."""
 
 
 @dataclass(frozen=True)
@@ -151,16 +155,12 @@ def read_source(
         raise InputError(f"{path}:{line}: a URDF begins with <robot>, this file with <{markup.root.tag}>")
     around = Packages(packages, path)
     if path.suffix == ".xacro" or any(element.tag.startswith("xacro:") for element in markup.lines):
-        from magtwin.urdf.source.xacro import expand  # with its interpreter, which a plain URDF does not need
-
-        repairs = Repairs()
-        xml, places = expand(path, around, arguments, repairs, skip_missing_includes=skip_missing_includes)
+        repairs, xacro = Repairs(), import_module(EXPANDER)
+        xml, places = xacro.expand(
+            path, around, arguments, repairs, skip_missing_includes=skip_missing_includes
+        )
         return Source(path, xml, MappingProxyType(places), around, repairs)
     if arguments:
         raise InputError(f"{path}: is not a xacro and takes no arguments; leave out {', '.join(arguments)}")
-    source = Source(
-        path, markup.root, MappingProxyType({e: (path, n) for e, n in markup.lines.items()}), around
-    )
-    if markup.late:
-        source.repairs.add("declaration-late", DECLARATION_LATE, (path.name, markup.late))
-    return source
+    places = MappingProxyType({element: (path, line) for element, line in markup.lines.items()})
+    return Source(path, markup.root, places, around)

@@ -10,8 +10,6 @@ import importlib.util
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
-from fnmatch import fnmatch
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -22,9 +20,9 @@ from xml.parsers.expat import ExpatError
 from magtwin.errors import InputError, hint
 from magtwin.files.file import read_bytes
 from magtwin.files.settings import yaml_loader
-from magtwin.urdf.repairs import DECLARATION_LATE, NOTE, Repairs
+from magtwin.urdf.repairs import NOTE, Repairs
 from magtwin.urdf.source.expression import GLOBALS, LARGEST, Budget, ExpressionError, check_size, evaluate
-from magtwin.urdf.source.markup import UnsafeError, in_order, parse_markup
+from magtwin.urdf.source.markup import UnsafeError, parse_markup
 from magtwin.urdf.source.package import MissingFileError, Packages
 
 UNITS, ELEMENT, FILE = 20_000_000, 100, 1_000
@@ -39,16 +37,6 @@ SIBLINGS = 16
 
 PLACE = "magtwin.place"
 """Key of a node's user data: its file and line."""
-
-UNIT_TAGS: Mapping[str, float] = {
-    "!radians": 1.0,
-    "!degrees": 0.017453292519943295,
-    "!meters": 1.0,
-    "!millimeters": 0.001,
-    "!foot": 0.3048,
-    "!inches": 0.0254,
-}
-"""Factors to radians and metres by YAML tag, with xacro's names."""
 
 _PIECES = re.compile(
     r"(?P<escaped>\$\$+[{(])|\$\{(?P<expression>[^}]*)\}|\$\((?P<command>[^)]*)\)|(?P<text>[^$]+|\$[^{($]+|\$$)"
@@ -82,8 +70,7 @@ def expand(
     Args:
         path: The xacro.
         packages: Packages for `$(find)`, and the folders from which files may be included.
-        arguments: Values of `<xacro:arg>`; they override its defaults. Where includes are skipped, also
-            values of properties that no file defines.
+        arguments: Values of `<xacro:arg>`; they override its defaults.
         repairs: Receives repairs and notes.
         skip_missing_includes: Whether to skip missing includes of which no macro is called.
 
@@ -92,8 +79,8 @@ def expand(
 
     Raises:
         InputError: The file is not XML, reads outside the packages, has an expression outside the language,
-            or expands without end; the message gives file and line. Or includes, arguments, macros or
-            properties are missing; the message lists all, with the options that would supply them.
+            or expands without end; the message gives file and line. Or includes, arguments or macros are
+            missing; the message lists all, with the options that would supply them.
     """
     return _Expansion(path, packages, arguments, repairs, skip_missing_includes).run()
 
@@ -108,7 +95,6 @@ class _Expansion:
         self._repairs, self._skip = repairs, skip
         self._absent: dict[str, str] = {}  # what the expansion cannot do without, and where
         self._skipped: dict[str, str] = {}  # includes, and where
-        self._undefined: dict[str, str] = {}  # properties that a skipped include would define, and where
         self._near: dict[str, str] = {}  # near names of missing packages
         self._optional = self._including = False
         self._asked: set[str] = set()
@@ -193,7 +179,7 @@ class _Expansion:
         Raises:
             InputError: Something is missing, and the expansion cannot do without it.
         """
-        absent = {**self._absent, **{f"property {name!r}": p for name, p in self._undefined.items()}}
+        absent = dict(self._absent)
         if absent or not self._skip:
             near = {name: self._near.get("/".join(name.split("/")[:3]), "") for name in self._skipped}
             includes = {f"include {name!r}{near[name]}": place for name, place in self._skipped.items()}
@@ -204,9 +190,7 @@ class _Expansion:
         supplies = list(self._repairs.supplies)
         advice = f"; give {' '.join(supplies)}" if supplies else "; put the files in their place"
         if self._skipped and not any(what.startswith("macro") for what in self._absent):
-            options = [option for option in supplies if option.startswith("--arg")]
-            options += [f"--arg {name}=VALUE" for name in self._undefined]
-            skip = ["`skip_missing_includes=True`", *options]
+            skip = ["`skip_missing_includes=True`", *(each for each in supplies if each.startswith("--arg"))]
             advice += f", or {' '.join(skip)}, as none of their macros is called"
         raise InputError(f"{self._path}: missing: {faults}{advice}")
 
@@ -233,13 +217,9 @@ class _Expansion:
             try:
                 return handle(node, *arguments)
             except self._library.XacroException as error:
-                unknown = f"unknown macro name: {node.tagName}" in str(error.args[0] or "")
-                if not unknown or (not self._skipped and self._path.suffix == ".xacro"):
+                if not self._skipped or f"unknown macro name: {node.tagName}" not in str(error.args[0] or ""):
                     raise
-                if self._skipped:
-                    self._miss(f"macro {node.tagName!r}")
-                else:
-                    self._repair("macro-unknown", f"<{node.tagName}> is no macro: left out")
+                self._miss(f"macro {node.tagName!r}")
                 self._library.replace_node(node, by=None)
                 return True
 
@@ -308,8 +288,7 @@ class _Expansion:
             if piece.lastgroup == "escaped":
                 content = content[1:]
             elif piece.lastgroup == "expression":
-                names = _Supplied(symbols, self) if self._skipped else symbols
-                value = evaluate(str(self._text(content, symbols)), names, self._budget)
+                value = evaluate(str(self._text(content, symbols)), symbols, self._budget)
                 content = check_size(value, self._budget, plain=True)
             elif piece.lastgroup == "command":
                 content = self._command(str(self._text(content, symbols)))
@@ -364,14 +343,6 @@ class _Expansion:
             return "0"
         return table[name]
 
-    def _property(self, name: str) -> Any:
-        """A property that no file defines, while includes are missing: that of the argument of its name."""
-        self._asked.add(name)
-        if name in self._arguments:
-            return _typed(self._arguments[name])
-        self._undefined.setdefault(name, self._place())
-        return 1
-
     def _variable(self, name: str, default: str | None = None) -> str:
         self._asked.add(name)
         if name in self._arguments:
@@ -393,57 +364,20 @@ class _Expansion:
             if not self._optional:
                 self._skipped[text] = self._place()
             return
-        wanted = self._library.abs_filename_spec(text)
-        files = self._matching(wanted) if _WILD.search(wanted) else [wanted]
-        if not files:
-            self._note(f"include {filename!r} matches no file")
-        for file in files:
-            path = self._check_inside(file, "include")
-            if not (path.exists() or self._optional):
-                name, other = os.path.relpath(path, self._path.parent), _other_suffix(path)
-                if not self._check_inside(str(other), "include").is_file():
-                    self._skipped[name] = self._place()
-                    continue
-                self._repair(
-                    "include-renamed", f"include {name!r} is missing: {other.name} beside it is included"
-                )
-                file = str(other)
-            yield file
-
-    def _matching(self, pattern: str) -> list[str]:
-        """Files and folders that a pattern names, sorted. Each entry that is looked at is paid for.
-
-        Raises:
-            ExpressionError: Its folder lies outside; or it climbs by `..` after a wildcard, from where it
-                could list everything.
-        """
-        match = _WILD.search(pattern)
-        assert match is not None
-        start = os.path.dirname(pattern[: match.start()])  # noqa: PTH120
-        self._check_inside(start, "include")
-        places, names = [start], pattern[len(start) :].split("/")
-        if ".." in names:
-            raise ExpressionError(f"include {pattern!r} has '..' after a wildcard; leave it out")
-        for name in names:
-            if name not in ("", "."):
-                places = [path for place in places for path in self._below(place, name)]
-        return sorted(places)
-
-    def _below(self, folder: str, name: str) -> list[str]:
-        """The entries of a folder that a name with or without wildcards names; none if it lies outside."""
-        self._budget.spend(ELEMENT)
-        path = Path(folder)
-        if not _WILD.search(name):
-            return [os.path.join(folder, name)] if os.path.lexists(path / name) else []  # noqa: PTH118
-        if not self._packages.holds(path):
-            return []
-        found = []
-        with suppress(OSError), os.scandir(path) as entries:
-            for entry in entries:
-                self._budget.spend(ELEMENT // 10)
-                if fnmatch(entry.name, name) and (name[0] == "." or entry.name[0] != "."):
-                    found.append(entry.path)
-        return found
+        file = self._library.abs_filename_spec(text)
+        if _WILD.search(file):
+            raise ExpressionError(f"include {filename!r} has a wildcard; name each file")
+        path = self._check_inside(file, "include")
+        if not (path.exists() or self._optional):
+            name, other = os.path.relpath(path, self._path.parent), _other_suffix(path)
+            if not self._check_inside(str(other), "include").is_file():
+                self._skipped[name] = self._place()
+                return
+            self._repair(
+                "include-renamed", f"include {name!r} is missing: {other.name} beside it is included"
+            )
+            file = str(other)
+        yield file
 
     def _check_inside(self, file: str, what: str) -> Path:
         self._budget.spend(FILE)
@@ -471,11 +405,8 @@ class _Expansion:
         markup = parse_markup(content, path)
         attributes = sum(len(element.attrib) for element in markup.lines)
         self._budget.spend(ELEMENT * (len(markup.lines) + attributes // 4))
-        if markup.late:
-            file = Path(os.path.relpath(path, self._path.parent)).as_posix()
-            self._repairs.add("declaration-late", DECLARATION_LATE, (file, markup.late))
         try:
-            document = minidom.parseString(in_order(content))
+            document = minidom.parseString(content)
         except ExpatError as error:
             reason = f"{error}".partition(":")[0]
             raise InputError(
@@ -502,8 +433,8 @@ class _Expansion:
                 factor * float(evaluate(str(loader.construct_scalar(node)), GLOBALS, self._budget))
             )
 
-        for tag, factor in UNIT_TAGS.items():
-            UnitLoader.add_constructor(tag, number(factor))
+        for unit in self._library.ConstructUnits:
+            UnitLoader.add_constructor(unit.value.tag, number(unit.value.conversion_constant))
         try:
             content = read_bytes(path, "YAML file", "YAML")
             self._budget.spend(PER_YAML * len(content))
@@ -541,26 +472,6 @@ class _Arguments(dict[str, Any]):
         if name in self._expansion._library.substitution_args_context["arg"]:
             return _typed(str(self._expansion._argument(name)))
         raise KeyError(name)
-
-
-class _Supplied(Mapping[str, Any]):
-    """Properties, where those that no file defines come from arguments."""
-
-    def __init__(self, symbols: Mapping[str, Any], expansion: _Expansion) -> None:
-        self._symbols, self._expansion = symbols, expansion
-        self.depth = getattr(symbols, "depth", 0)
-
-    def __getitem__(self, name: str) -> Any:
-        try:
-            return self._symbols[name]
-        except KeyError:
-            return self._expansion._property(name)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._symbols)
-
-    def __len__(self) -> int:
-        return len(self._symbols)
 
 
 class _Placed:

@@ -6,8 +6,8 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from magtwin.errors import InputError
-from magtwin.field.sources.bodies import mesh_moments
 from magtwin.field.sources.magnets import body_of
+from magtwin.field.sources.moments import mesh_moments
 from magtwin.frames import IDENTITY_XYZW, canonical, quat_conjugate, quat_multiply, rotate, xyzw_from_wxyz
 from magtwin.spec.base import ZERO3, Quat, Vec3
 from magtwin.spec.magnetics import SourceSpec

@@ -17,9 +17,9 @@ from magtwin.field.sources.bodies import (
     Body,
     demagnetising,
     induced_magnetization,
-    mesh_moments,
 )
 from magtwin.field.sources.dipoles import dipole_field_nt
+from magtwin.field.sources.moments import mesh_moments
 from magtwin.frames import quat_from_rpy, rotate
 
 CUBE = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float) / 2

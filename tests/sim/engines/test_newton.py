@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 from places import TESTS
 from pxr import Usd, UsdPhysics
 
-from magtwin.urdf import convert_urdf
+from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.options import Options
 
 LACKING = [

@@ -1,4 +1,4 @@
-"""Sensor: `<sensor>` elements of `<gazebo>` tags as prims on their links.
+"""Equipment: the drive of a robot, and `<sensor>` elements of `<gazebo>` tags as prims on their links.
 
 Follows SDFormat's specification of `<sensor>` (sdformat.org/spec). Gazebo's sensors look along x with z up,
 USD's cameras along -z with y up.
@@ -7,7 +7,7 @@ USD's cameras along -z with y up.
 import contextlib
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdRender, Vt
 from magtwin.errors import InputError, near
 from magtwin.frames import matrix_from_quat, quat_from_rpy
 from magtwin.spec.base import ZERO3
+from magtwin.spec.drive import DriveSpec
 from magtwin.spec.sensors import ImuSpec, LidarSpec, MagnetometerSpec
 from magtwin.urdf.description.tag import Element, Tags
 from magtwin.urdf.meshes.mesh_layer import free_child
@@ -24,6 +25,9 @@ from magtwin.urdf.shape import pose_of
 from magtwin.usd.schema import prims_with
 from magtwin.usd.sensors import (
     EMITTER_API,
+    JOINT_FIELDS,
+    WHEELS_FIELDS,
+    define_drive,
     define_imu,
     define_isaac_imu,
     define_lidar,
@@ -89,15 +93,13 @@ def define_sensors(tags: Tags, robot: Usd.Prim, prim_of: Callable[[str], Usd.Pri
     """Author every `<sensor>` of `<gazebo reference="LINK">` with a known type on its link's prim.
 
     The first IMU, magnetometer and spinning LiDAR of a robot get magtwin's schemas, so that magtwin simulates
-    them. All others become NVIDIA's types or USD cameras only. Sensors of other types are kept as text, with
-    a note.
+    them. All others become NVIDIA's types or USD cameras only. A sensor without the figures that its type
+    needs becomes a frame with metadata. Sensors of other types are kept as text, with a note.
 
     Args:
         tags: Tags of the description.
         robot: The robot's prim.
         prim_of: Returns the prim of a link by its name.
-
-    A sensor without the figures that its type needs becomes a frame with metadata.
     """
     made, description = list[Usd.Prim](), tags.description
     for block in tags.blocks("gazebo"):
@@ -124,6 +126,20 @@ def define_sensors(tags: Tags, robot: Usd.Prim, prim_of: Callable[[str], Usd.Pri
                 prim, rate = site.define(), tags.number(sensor, "update_rate", least=0.0)
                 made.append(_metadata(prim, type=kind, **({} if rate is None else {"rateHz": rate})))
     return made
+
+
+def define_differential(robot: Usd.Prim, spec: DriveSpec, prim_names: Mapping[str, str]) -> Usd.Prim:
+    """Author a drive on the robot's prim.
+
+    Args:
+        robot: Its joints exist already.
+        spec: The drive, with the joint names of the URDF.
+        prim_names: Joint names in USD by their URDF names.
+    """
+    named: dict[str, Any] = {f: prim_names.get(getattr(spec, f), getattr(spec, f)) for f in JOINT_FIELDS}
+    for field in WHEELS_FIELDS:
+        named[field] = tuple(prim_names.get(name, name) for name in getattr(spec, field))
+    return define_drive(robot, replace(spec, **named))
 
 
 def _define_imu(tags: Tags, sensor: Element, site: Site, robot: Usd.Prim) -> Usd.Prim:
