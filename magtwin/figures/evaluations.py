@@ -4,7 +4,6 @@ import csv
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,14 +23,17 @@ from magtwin.figures.canvas import (
     short_name,
 )
 from magtwin.figures.maps import mean_field_ut
-from magtwin.figures.page import Page, Section, Table, write_pages
+from magtwin.figures.page import Page, Section, Table
+from magtwin.figures.reports import section_of_traversals
 from magtwin.figures.training import draw_correlations, label_epochs
 from magtwin.files.file import read_text
 from magtwin.learn.data.correlation import correlations
 from magtwin.learn.data.features import FEATURES, FULL, features
+from magtwin.learn.evaluation.budget import TERMS, Budget
 from magtwin.learn.evaluation.evaluation import PAPER, Evaluation, Judged
 from magtwin.learn.evaluation.scores import COVERED, DRAWS, LEVEL
 from magtwin.report.verdict import Z_90
+from magtwin.run.compare import Traversals
 
 NAME = "evaluation"
 """Name of the report's files."""
@@ -61,19 +63,17 @@ EPOCH, CURVES = "number", {"train_rmse_nt": ("training", "--"), "val_rmse_nt": (
 def page_of_evaluation(
     evaluation: Evaluation,
     *,
-    title: str = "Evaluation",
     curves: Mapping[str, Sequence[Mapping[str, float]]] | None = None,
-    more: Sequence[Section] = (),
-    data: Mapping[str, Any] | None = None,
+    budgets: Sequence[Budget] = (),
+    both: tuple[Traversals, tuple[str, str]] | None = None,
 ) -> Page:
     """The report of an evaluation.
 
     Args:
         evaluation: Result of `magtwin.learn.evaluation.evaluate.evaluate`.
-        title: Title of the page.
         curves: Learning curves by model name, as `read_curve` gives them.
-        more: Further sections, such as an error budget.
-        data: Figures of these sections for the JSON form.
+        budgets: Error budgets of its models.
+        both: One path driven twice, and the names of the two runs.
     """
     every = evaluation.every
     against = "the exact field" if evaluation.truth else "the reading"
@@ -92,25 +92,15 @@ def page_of_evaluation(
         Section("Inputs and the disturbance", "", _known(_rank_correlations(evaluation))),
         Section("A run", "", a_run),
         Section("Errors by path", "", by_path),
-        *more,
+        *([_budgets(budgets)] if budgets else []),
+        *([section_of_traversals(*both)] if both else []),
         Section("Every score", "", (), (_intervals(evaluation),)),
     )
     sections = tuple(section for section in sections if section.tables or section.pictures)
-    return Page(title, " ".join([*verdicts, lead]), sections, data={**evaluation.summary(), **(data or {})})
-
-
-def write_evaluation(page: Page, folder: str | os.PathLike[str], *, force: bool = False) -> None:
-    """Write a report as a folder: evaluation.html, .md and .json, and the pictures of the Markdown page.
-
-    Args:
-        page: The report.
-        folder: The folder to make.
-        force: Whether to replace an existing folder.
-
-    Raises:
-        InputError: The folder exists and `force` was not given.
-    """
-    write_pages(page, folder, NAME, force=force)
+    data = evaluation.summary()
+    data |= {"budget": {"models": [budget.summary() for budget in budgets]}} if budgets else {}
+    data |= {"traversals": both[0].summary()} if both else {}
+    return Page("Evaluation", " ".join([*verdicts, lead]), sections, data=data)
 
 
 def read_curve(weights: str | os.PathLike[str]) -> tuple[Mapping[str, float], ...]:
@@ -201,6 +191,17 @@ def _intervals(evaluation: Evaluation) -> Table:
     return Table("With intervals", (*head, "coverage", "out of distribution"), rows, note)
 
 
+def _budgets(budgets: Sequence[Budget]) -> Section:
+    lead = (
+        "On a twin the exact value of every part of the error is known. The mean absolute error [nT] that "
+        "remains when the terms are closed one after the other, from left to right. Closing a term removes "
+        "its part of the error, less what the model learned of it in training."
+    )
+    rows = tuple((budget.name, budget.mae_nt, *budget.left_nt) for budget in budgets)
+    head = ("model", "all", *(f"without {term}" for term in TERMS))
+    return Section("Error budget", lead, (), (Table("Errors that remain", head, rows),))
+
+
 def _models(evaluation: Evaluation) -> Table:
     rows = tuple(
         (
@@ -240,12 +241,12 @@ def _left_out(evaluation: Evaluation) -> Table:
     return Table("Readings left out", ("reason", "readings"), rows, note)
 
 
-def ink(m: int) -> str:
+def _ink(m: int) -> str:
     """Colour of a model by its index."""
     return INKS[m % len(INKS)]
 
 
-def trained_models(evaluation: Evaluation) -> list[int]:
+def _trained(evaluation: Evaluation) -> list[int]:
     """Indices of at most `MOST_PANELS` models from weights files; if there are none, of all but the naive."""
     own = [i for i, one in enumerate(evaluation.candidates) if "sha256" in one.metadata]
     own = own or list(range(1, len(evaluation.candidates))) or [0]
@@ -253,7 +254,7 @@ def trained_models(evaluation: Evaluation) -> list[int]:
 
 
 def _best(evaluation: Evaluation) -> int:
-    return min(trained_models(evaluation), key=lambda m: evaluation.every.scores[m].mae_nt)
+    return min(_trained(evaluation), key=lambda m: evaluation.every.scores[m].mae_nt)
 
 
 def _rank_correlations(evaluation: Evaluation) -> Picture | None:
@@ -282,7 +283,7 @@ def _rank_correlations(evaluation: Evaluation) -> Picture | None:
 
 def _time_series(evaluation: Evaluation) -> Picture:
     """Figure 5: field as measured, by the map alone and by each model, and the errors with their interval."""
-    one, shown = _middle(evaluation), trained_models(evaluation)
+    one, shown = _middle(evaluation), _trained(evaluation)
     t = one.run["t"] - one.run["t"][0]
     seen = t <= SHOWN_S
     t, kept = t[seen], one.kept[seen]
@@ -296,12 +297,12 @@ def _time_series(evaluation: Evaluation) -> Picture:
         half, error = Z_90 * one.sd_nt[m, seen], total - measured
         draw_line(above, t, measured / 1000, color=INK, lw=1.8, label="measured")
         draw_line(above, t, alone / 1000, color="0.55", lw=1.0, label="map alone")
-        draw_line(above, t, total / 1000, color=ink(m), lw=1.0, label="map and model")
+        draw_line(above, t, total / 1000, color=_ink(m), lw=1.0, label="map and model")
         if np.isfinite(half).any():
-            band = {"color": ink(m), "alpha": 0.18, "lw": 0, "label": f"its {COVERED:.0%} interval"}
+            band = {"color": _ink(m), "alpha": 0.18, "lw": 0, "label": f"its {COVERED:.0%} interval"}
             below.fill_between(t[rows], -half[rows], half[rows], **band)
         draw_line(below, t, alone - measured, color="0.55", lw=0.8)
-        draw_line(below, t, error, color=ink(m))
+        draw_line(below, t, error, color=_ink(m))
         below.axhline(0, color=INK, lw=0.6)
         mae = np.nanmean(np.abs(error)) if np.isfinite(error).any() else np.nan
         title = f"{short_name(evaluation.names[m], 40)}: MAE {mae:.0f} nT"
@@ -371,7 +372,7 @@ def _path_errors(evaluation: Evaluation) -> Picture:
         at = np.arange(len(cases)) + (m - (count - 1) / 2) * width
         mae = np.array([case.scores[m].mae_nt for case in cases])
         low, high = np.array([case.scores[m].mae_interval_nt for case in cases]).T
-        ax.bar(at, mae, 0.92 * width, color=ink(m), label=name)
+        ax.bar(at, mae, 0.92 * width, color=_ink(m), label=name)
         spread = np.nan_to_num(np.stack([mae - low, high - mae]).clip(0))
         ax.errorbar(at, mae, yerr=spread, fmt="none", ecolor=INK, elinewidth=0.8, capsize=1.5)
     ax.set_xticks(np.arange(len(cases)), [case.name for case in cases], fontsize=9)
@@ -397,7 +398,7 @@ def _learning_curves(
             points = [(row[EPOCH], row[column]) for row in rows if column in row]
             if points:
                 text = f"{evaluation.names[m]}, {part}"
-                ax.plot(*zip(*points, strict=True), ls=style, color=ink(m), label=text)
+                ax.plot(*zip(*points, strict=True), ls=style, color=_ink(m), label=text)
     label_epochs(ax)
     legend_below(figure)
     title = "Figure 6 c: error in training and on validation recordings over the epochs"

@@ -3,10 +3,11 @@
 Training is `magtwin.learn.training.train.train`.
 """
 
+import functools
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -23,7 +24,7 @@ from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import MANIFEST, Dataset, open_dataset
 from magtwin.learn.data.dataset import build_dataset as build
 from magtwin.learn.data.recording import Source, sources_of
-from magtwin.learn.evaluation.budget import Budget, TrueError, Truth, budgets, steps, true_errors
+from magtwin.learn.evaluation.budget import Budget, Truth, budget
 from magtwin.learn.evaluation.candidates import (
     NAIVE,
     Candidate,
@@ -45,7 +46,7 @@ from magtwin.learn.models.predictor import Predictor, load_predictor
 from magtwin.learn.training.model_card import widened_card
 from magtwin.run.run import Run
 from magtwin.spec.scene import Scene
-from magtwin.twin import Twin, check_scene, in_session_of, open_twin, scene_file
+from magtwin.twin import check_scene, in_session_of, open_twin, scene_file
 from magtwin.usd.scene import read_scene
 
 File = str | os.PathLike[str]
@@ -328,39 +329,14 @@ def widen(
     return wide
 
 
-@dataclass(frozen=True)
-class ErrorBudget:
-    """What makes the errors of an evaluation's models; see `magtwin.learn.evaluation.budget`."""
-
-    budgets: tuple[Budget, ...]
-    map_errors: tuple[TrueError, ...]
-
-    order: tuple[int, ...]
-    """Models, step by step from the paper's configuration on."""
-
-    names: tuple[str, ...]
-    """Names of the models."""
-
-    def summary(self) -> dict[str, Any]:
-        """All figures as plain numbers and texts."""
-        return {
-            "models": [budget.summary() for budget in self.budgets],
-            "maps": {
-                error.map: {name: value for name, value in vars(error).items() if name != "map"}
-                for error in self.map_errors
-            },
-            "steps": [self.names[m] for m in self.order],
-        }
-
-
 def error_budget(
     evaluation: Evaluation,
     scene: File,
     train: Dataset | File,
     *,
     progress: Progress = lambda done, total, what: None,
-) -> ErrorBudget:
-    """How much of the errors is map, lever arm, latency, sessions, platform and sensor, on a twin.
+) -> tuple[Budget, ...]:
+    """How much of the error of each model is map, lever arm, latency, sessions, platform and sensor.
 
     Args:
         evaluation: An evaluation on runs of a twin.
@@ -371,22 +347,20 @@ def error_budget(
     Raises:
         InputError: A recording has no truth, or is of another scene.
     """
-    twins: dict[Any, Twin] = {}
-
-    def opened(kind: Any) -> Twin:
-        if kind not in twins:
-            twins[kind] = open_twin(Path(scene), magnetometer=kind)
-        return twins[kind]
+    opened = functools.cache(lambda kind: open_twin(Path(scene), magnetometer=kind))
 
     def scene_in_session(name: str, run: Run) -> Scene:
         of_session = in_session_of(opened(run.metadata.get("magnetometer")), run.metadata).scene
         check_scene(of_session, run.metadata, name)
         return of_session
 
-    truth = Truth(opened("physical").scene, scene_in_session)
-    order = steps(evaluation)
-    made = budgets(evaluation, order, truth, _dataset(train), evaluation.learned or None, progress=progress)
-    return ErrorBudget(tuple(made), tuple(true_errors(evaluation, truth)), tuple(order), evaluation.names)
+    truth, train = Truth(opened("physical").scene, scene_in_session), _dataset(train)
+    made = []
+    for m, name in enumerate(evaluation.names):
+        progress(m, len(evaluation.names), name)
+        made.append(budget(evaluation, m, truth, train, evaluation.learned or None))
+    progress(len(made), len(made), "")
+    return tuple(made)
 
 
 def map_of_scene(scene: File) -> Path:

@@ -15,7 +15,6 @@ from magtwin.learn.data.features import columns_of, features
 from magtwin.learn.data.origin import same_robot
 from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.predictor import Predictor, load_predictor
-from magtwin.learn.models.regressor import summary_of
 from magtwin.learn.models.weights import MetadataValue
 from magtwin.report.summary import Summarized, Summary
 from magtwin.report.verdict import OF_DRIVE, ONLY_OWN, OTHERS, OWN
@@ -174,4 +173,4 @@ class NeuralMagnetometer(Summarized):
         return OWN if known else OTHERS if wide else ONLY_OWN
 
     def _summary(self) -> Summary:
-        return summary_of(self.net, f"NeuralMagnetometer {self.name}".rstrip())
+        return self.net.summary(f"NeuralMagnetometer {self.name}".rstrip())

@@ -49,8 +49,6 @@ class Mixeds:
     @staticmethod
     def fit(task: FitTask) -> Fit:
         """Fit mu to the nominal plant, Lambda and s^2 to all sessions, and factors to plants left out."""
-        if task.resume:
-            raise InputError("a mixed model is fitted at once; there is no checkpoint to resume from")
         if task.init is not None:
             raise InputError("a mixed model is fitted anew; leave out init")
         drives = list(_drives(task))

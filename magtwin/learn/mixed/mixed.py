@@ -20,7 +20,7 @@ from magtwin.learn.data.inputs import Array, inputs_from, scaler_tensors
 from magtwin.learn.mixed.effects import Effects
 from magtwin.learn.mixed.session_effects import effects_of_drive
 from magtwin.learn.models.calibration import Spread, spread_from, spread_like
-from magtwin.learn.models.regressor import Regressor
+from magtwin.learn.models.predictor import Predictor
 from magtwin.learn.models.weights import Weights
 from magtwin.report.report import Figure
 
@@ -32,7 +32,7 @@ FACTORS = ("calibrated", "online")
 
 
 @dataclass(kw_only=True, repr=False)
-class Mixed(Regressor):
+class Mixed(Predictor):
     """A linear model with effects of the session, and the spread of its errors."""
 
     prior: Effects
@@ -243,6 +243,4 @@ def mixed_of(weights: Weights) -> Mixed:
         widening=weights.number("widening", above=0.0),
         families=int(weights.number("families", above=0.0)),
         penalty=weights.number("penalty"),
-        residual_sd_nt=weights.residual_sd_nt,
-        metadata=dict(weights.about["facts"]),
     )

@@ -11,13 +11,13 @@ from magtwin.errors import InputError
 from magtwin.learn.data.inputs import Array, Inputs
 from magtwin.learn.models.linear import Linear, like, linear_from
 from magtwin.learn.models.network import FieldNet, net_of
-from magtwin.learn.models.regressor import Regressor
+from magtwin.learn.models.predictor import Predictor
 from magtwin.learn.models.weights import Weights, tensors_below
 from magtwin.report.report import Figure
 
 
 @dataclass(kw_only=True, repr=False)
-class Hybrid(Regressor):
+class Hybrid(Predictor):
     """A disturbance y = base(x) + net(x clipped to the training ranges), or the base alone.
 
     Outside the training ranges the network keeps its value at their edge, while the base extrapolates
@@ -96,6 +96,4 @@ def hybrid_of(weights: Weights) -> Hybrid:
         base=linear_from(weights, base),
         net=net,
         sd_factor=weights.number("sd_factor", above=0.0),
-        residual_sd_nt=weights.residual_sd_nt,
-        metadata=dict(weights.about["facts"]),
     )

@@ -23,7 +23,7 @@ from magtwin.learn.models.calibration import (
     spread_from,
     spread_like,
 )
-from magtwin.learn.models.regressor import Regressor
+from magtwin.learn.models.predictor import Predictor
 from magtwin.learn.models.weights import Weights
 from magtwin.report.report import Figure
 
@@ -35,7 +35,7 @@ Weighting = Literal["auto", "label_sd", "none"]
 
 
 @dataclass(kw_only=True, repr=False)
-class Linear(Regressor):
+class Linear(Predictor):
     """A disturbance constant + sum_j c_j z_j with z = (x - mean) / scale, and the spread of its errors."""
 
     constant_nt: float
@@ -197,10 +197,7 @@ def linear_of(weights: Weights) -> Linear:
     Raises:
         InputError: Its parts do not fit each other.
     """
-    model = linear_from(weights, weights.fit(like(len(weights.features))))
-    model.residual_sd_nt = weights.residual_sd_nt
-    model.metadata = dict(weights.about["facts"])
-    return model
+    return linear_from(weights, weights.fit(like(len(weights.features))))
 
 
 def linear_from(weights: Weights, tensors: Mapping[str, NDArray[Any]]) -> Linear:

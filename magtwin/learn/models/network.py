@@ -16,13 +16,13 @@ from magtwin.files.kinds import expected
 from magtwin.learn.data.features import FULL
 from magtwin.learn.data.inputs import Array, inputs_from, scaler_tensors
 from magtwin.learn.models.perceptron import Layer, outputs
-from magtwin.learn.models.regressor import Regressor
+from magtwin.learn.models.predictor import Predictor
 from magtwin.learn.models.weights import Weights, say
 from magtwin.report.report import Figure
 
 
 @dataclass(kw_only=True, repr=False)
-class FieldNet(Regressor):
+class FieldNet(Predictor):
     """Disturbance of the field magnitude [nT] from features of a Run, (N, F) -> (N,).
 
     A multilayer perceptron between two scalers:

@@ -1,7 +1,5 @@
 """Fit a FieldNet to features and labels."""
 
-import math
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -9,14 +7,12 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.errors import InputError, find
-from magtwin.learn.data.features import feature_names
+from magtwin.errors import InputError
 from magtwin.learn.data.inputs import Inputs, inputs_of
 from magtwin.learn.models.network import FieldNet
 from magtwin.learn.models.predictor import Epoch
-from magtwin.learn.training.descent import Course, Dropout, Learner, check_device, descend
+from magtwin.learn.training.descent import Descent, Dropout
 from magtwin.learn.training.module import NetModule
-from magtwin.learn.training.state import digest
 from magtwin.parallel import check_room
 
 Array = NDArray[np.float64]
@@ -41,9 +37,6 @@ def train(
     lr: float = 1e-3,
     patience: int | None = None,
     init: FieldNet | None = None,
-    freeze: Sequence[str] = (),
-    checkpoint: str | os.PathLike[str] | None = None,
-    resume: bool = False,
     device: str = "cpu",
     progress: Callable[[Epoch], None] | None = None,
     advance: Callable[[int, int], None] | None = None,
@@ -55,13 +48,13 @@ def train(
     because rows of one run are correlated and a network can recognise a run by its battery.
 
     Args:
-        x: Training features, in the units of `magtwin.learn.data.features`, shape (N, F).
+        x: Training features, in the units of `magtwin.learn.data.features`, shape (N, F); none is nan.
         y: Training labels [nT], shape (N,).
         x_val: Features of other runs, shape (M, F).
         y_val: Their labels [nT], shape (M,).
         rng: Source of the initial weights, the order of rows and dropout. The same state, machine, device and
             number of threads give the same bits.
-        weight: Weight of each training row, shape (N,), on any scale. Default: all alike.
+        weight: Weight of each training row, shape (N,), above 0, on any scale. Default: all alike.
         features: Names of the features, in order, or the name of a set.
         layers: Widths of the hidden layers.
         dropout: Share of units dropped in training, to the nearest 65,536th.
@@ -71,9 +64,6 @@ def train(
         patience: Stop after this many epochs without improvement; None runs all epochs.
         init: Network of the same inputs and layers to continue from, with its scalers. It is epoch 0, so that
             the result is never worse on the validation rows.
-        freeze: Names of layers that stay as in `init`: "layers.0" is the first.
-        checkpoint: File for the state after each epoch.
-        resume: Continue from `checkpoint`; the result is that of an uninterrupted training.
         device: Where torch trains, "cpu" or "cuda". The result is on the CPU.
         progress: Called after each epoch.
         advance: Called after each step with the rows done and the rows of all epochs.
@@ -82,25 +72,12 @@ def train(
         The network, with `residual_sd_nt` the RMSE on the validation rows, and its epochs.
 
     Raises:
-        InputError: Rows with nan or of the wrong shape, constant labels, training diverged, no such device,
-            an `init` of other inputs or layers, or a checkpoint of another training.
+        InputError: Constant labels, training diverged, or an `init` of other inputs or layers.
     """
-    names = feature_names(features)
-    x, y = _rows("training", x, y, names)
-    x_val, y_val = _rows("validation", x_val, y_val, names)
-    counts: Array | None = None
-    if weight is not None:
-        counts = np.array(weight, float)
-        if counts.shape != y.shape or not (np.isfinite(counts).all() and (counts > 0).all()):
-            raise InputError(f"weight must be above 0 and finite, one for each of {len(y)} training rows")
-        counts /= counts.mean()
+    x, y, x_val, y_val = (np.ascontiguousarray(part, float) for part in (x, y, x_val, y_val))
+    counts = None if weight is None else np.array(weight, float) / np.mean(weight)
     if y.std() < 1e-9:
         raise InputError(f"the label is {y[0]:g} nT in every training row; there is nothing to learn")
-    if not (epochs > 0 and batch > 0 and lr > 0):
-        raise InputError(f"epochs, batch and lr must be above 0, got {epochs}, {batch} and {lr}")
-    if patience is not None and patience < 1:
-        raise InputError(f"patience must be 1 epoch at least, got {patience}; leave it out to run all epochs")
-    check_device(device)
     if device == "cpu":
         check_room(
             BYTES_PER_UNIT * min(batch, len(x)) * sum(layers),
@@ -109,39 +86,17 @@ def train(
             "layers",
         )
     seed = int(rng.integers(2**62))
-    inputs = inputs_of(x, names)
+    inputs = inputs_of(x, features)
     with torch.random.fork_rng(devices=[]):  # torch draws initial weights from its global generator
         torch.manual_seed(seed)
         if init is None:
             module = NetModule(inputs, layers, dropout=dropout, y_mean=y.mean(), y_scale=y.std())
         else:
             module = NetModule.of(_continued(init, inputs, tuple(layers), dropout))
-    _freeze(module, freeze, init)
-    settings = {
-        "features": list(names),
-        "layers": list(layers),
-        "dropout": dropout,
-        "freeze": sorted(freeze),
-        "device": device,
-        "threads": torch.get_num_threads(),
-        "torch": str(torch.__version__),
-    }
-    if checkpoint is not None:
-        settings["rows"] = digest(x, y, x_val, y_val, *([] if counts is None else [counts]))
-        settings["init"] = digest(*init.tensors().values()) if init is not None else ""
-    history = descend(
-        Learner(
-            *(module, x, y, counts, x_val, y_val),
-            Dropout(dropout, torch.Generator(device).manual_seed(seed + 1)),
-        ),
-        Course(epochs=epochs, batch=batch, lr=lr, patience=patience, seed=seed),
-        settings,
-        started=init is not None,
-        checkpoint=checkpoint,
-        resume=resume,
-        progress=progress,
-        advance=advance,
-    )
+    drop = Dropout(dropout, torch.Generator(device).manual_seed(seed + 1))
+    history = Descent(
+        *(module, x, y, counts, x_val, y_val), drop=drop, epochs=epochs, batch=batch, lr=lr, seed=seed
+    ).run(started=init is not None, patience=patience, progress=progress, advance=advance)
     return module.net(residual_sd_nt=min(epoch.val_rmse_nt for epoch in history)), history
 
 
@@ -154,29 +109,3 @@ def _continued(init: FieldNet, inputs: Inputs, hidden: tuple[int, ...], dropout:
             "features and layers"
         )
     return replace(init, inputs=init.inputs.grown(inputs), dropout=dropout)
-
-
-def _freeze(module: NetModule, names: Sequence[str], init: FieldNet | None) -> None:
-    """Exclude layers from the training."""
-    if names and init is None:
-        raise InputError("freeze keeps layers of trained weights: give init too")
-    layers = {f"layers.{i}": layer for i, layer in enumerate(module.layers)}
-    for name in names:
-        find("layer", name, layers).requires_grad_(False)
-
-
-def _rows(kind: str, x: ArrayLike, y: ArrayLike, names: Sequence[str]) -> tuple[Array, Array]:
-    """Features and labels as float64 arrays, checked."""
-    x, y = np.ascontiguousarray(x, float), np.ascontiguousarray(y, float)
-    if x.ndim != 2 or y.shape != x.shape[:1] or x.shape[1] != len(names) or not len(y):
-        raise InputError(
-            f"{kind} rows must be features (N, {len(names)}) and labels (N,), got {x.shape} and {y.shape}"
-        )
-    bad = ~(np.isfinite(x).all(axis=1) & np.isfinite(y))
-    if bad.any():
-        row = int(np.argmax(bad))
-        column = next((n for n, v in zip(names, x[row], strict=True) if not math.isfinite(v)), "label")
-        raise InputError(
-            f"{int(bad.sum())} {kind} rows hold nan or inf, first row {row} in {column}; leave them out"
-        )
-    return x, y

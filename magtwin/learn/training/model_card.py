@@ -27,10 +27,7 @@ def model_card(result: TrainingResult, name: str, checksum: str) -> str:
     if result.config.licence:
         what += f" Licence: {result.config.licence}."
     if result.config.init is not None:
-        kept = ", ".join(result.config.freeze) or "no layer"
-        what += (
-            f" It continues from `{metadata['init']}` (SHA-256 `{metadata['init_sha256']}`), {kept} frozen."
-        )
+        what += f" It continues from `{metadata['init']}` (SHA-256 `{metadata['init_sha256']}`)."
     parts = [
         f"# {name}",
         _wrapped(what),
@@ -104,9 +101,8 @@ def _how(result: TrainingResult) -> str:
 
 def _table(result: TrainingResult) -> str:
     """Errors by part, and on the test by path."""
-    before = result.config.init is not None
     heads = ["rows of", "recordings", "rows", "MAE", "RMSE", "naive MAE", "naive RMSE", "MAE / naive"]
-    heads += ["ridge MAE", "ridge RMSE", "within 90 %", *(["MAE before"] if before else [])]
+    heads += ["ridge MAE", "ridge RMSE", "within 90 %"]
     lines = [_line(heads), _line(["---"] * len(heads))]
     shown = result.paths[:MOST_NAMES] if len(result.paths) > 1 else ()
     for errors in (*result.parts, *shown):
@@ -119,7 +115,7 @@ def _table(result: TrainingResult) -> str:
         ]
         cells += [f"{errors.ratio:.3f}", f"{errors.ridge_mae_nt:.1f}", f"{errors.ridge_rmse_nt:.1f}"]
         cells += ["-" if math.isnan(errors.coverage) else f"{errors.coverage:.3f}"]
-        lines.append(_line([*cells, *([f"{errors.before_mae_nt:.1f}"] if before else [])]))
+        lines.append(_line(cells))
     if len(result.paths) > MOST_NAMES:
         lines.append(f"\nThe first {MOST_NAMES} of {len(result.paths)} paths are shown.")
     return "\n".join(lines)
@@ -145,7 +141,7 @@ def _reproduce(result: TrainingResult, name: str) -> str:
     metadata = result.predictor.metadata
     by = f"magtwin {metadata['magtwin']}"
     if "torch" in metadata:
-        by += f", torch {metadata['torch']}, with --threads {metadata['threads']} on {metadata['device']}"
+        by += f", torch {metadata['torch']}, on {metadata['device']} with threads = {metadata['threads']}"
     command = f"magtwin train {_plain(str(metadata['dataset']))} --config F.toml --out {name}"
     text = _wrapped(f"{by}, and as `F.toml` in `{command}`:")
     return f"{text}\n\n```toml\n{str(metadata['config']).rstrip()}\n```"

@@ -34,9 +34,6 @@ class PartErrors:
     coverage: float
     """Share of rows within the predicted 90 % interval."""
 
-    before_mae_nt: float
-    """MAE of the initial network; nan if training started anew."""
-
     @property
     def ratio(self) -> float:
         """MAE divided by the naive MAE (lower is better), as in the paper's Table 1."""
@@ -111,8 +108,6 @@ class TrainingResult(Summarized):
                 Figure(f"{errors.name} ratio", errors.ratio, note="MAE divided by naive MAE"),
                 Figure(f"{errors.name} coverage", errors.coverage, note="share within intervals of 90 %"),
             ]
-            if not math.isnan(errors.before_mae_nt):
-                figures.append(Figure(f"{errors.name} MAE before", errors.before_mae_nt, "nT"))
         metadata = {name: value for name, value in shown(self.predictor.metadata).items() if name != "config"}
         return Report(title, tuple(figures), metadata, self.verdict())
 

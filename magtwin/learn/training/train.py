@@ -4,7 +4,6 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from magtwin.errors import InputError
 from magtwin.files.file import sha256
-from magtwin.files.outputs import afterwards, check_free, output, transaction
+from magtwin.files.outputs import check_free, output, transaction
 from magtwin.learn.data.dataset import MANIFEST, Dataset, open_dataset
 from magtwin.learn.data.origin import NOMINAL, ROBOT_METADATA
 from magtwin.learn.data.residuals import HeldOut, held_out_errors, residuals
@@ -45,7 +44,6 @@ def train(
     out: str | os.PathLike[str] | None = None,
     config: TrainConfig | None = None,
     force: bool = False,
-    resume: bool = False,
     progress: Callable[[Epoch], None] | None = None,
     advance: Callable[[int, int], None] | None = None,
     **options: Any,
@@ -54,11 +52,9 @@ def train(
 
     Args:
         dataset: Labelled recordings, or the folder of a data set.
-        out: Weights file to write, .safetensors. The model card is written beside it as .md. After each epoch
-            the state is written to .checkpoint, which is removed at the end.
+        out: Weights file to write, .safetensors. The model card is written beside it as .md.
         config: Model and options. Default: the paper's network.
         force: Replace existing files.
-        resume: Continue from the checkpoint beside `out`; the weights are those of an uninterrupted training.
         progress: Called after each epoch.
         advance: Called after each step with the rows done and the rows of all epochs.
         **options: Fields of `TrainConfig`, such as model="hybrid" or seed=3. They override `config`.
@@ -68,30 +64,14 @@ def train(
             not fit the model, or a file exists.
     """
     config = (config or TrainConfig()).with_options(**options)
-    checkpoint = None
-    if out is not None:
-        out = Path(out)
-        checkpoint = out.with_suffix(".checkpoint")
-        for path in (out, out.with_suffix(".md")):
-            check_free(path, force=force)
-        if checkpoint.exists() and not (resume or force):
-            raise InputError(
-                f"{checkpoint}: an unfinished training; resume it (--resume), or replace it (--force)"
-            )
+    for path in () if out is None else (Path(out), Path(out).with_suffix(".md")):
+        check_free(path, force=force)
     dataset = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
     deals, draws = np.random.default_rng(config.seed).spawn(2)
     parts = split_recordings(dataset.recordings, config.split, hold_out=config.hold_out, rng=deals)
-    result = fit(
-        config,
-        dataset,
-        parts,
-        rng=draws,
-        checkpoint=checkpoint,
-        resume=resume,
-        progress=progress,
-        advance=advance,
-    )
-    if out is not None and checkpoint is not None:
+    result = fit(config, dataset, parts, rng=draws, progress=progress, advance=advance)
+    if out is not None:
+        out = Path(out)
         with (
             transaction(),
             output(out, force=force) as weights,
@@ -99,7 +79,6 @@ def train(
         ):
             result.predictor.save(weights)
             card.write_text(model_card(result, out.name, sha256(weights)), encoding="utf-8")
-        afterwards(partial(checkpoint.unlink, missing_ok=True))
     return result
 
 
@@ -109,8 +88,6 @@ def fit(
     split: Split,
     *,
     rng: np.random.Generator,
-    checkpoint: Path | None = None,
-    resume: bool = False,
     progress: Callable[[Epoch], None] | None = None,
     advance: Callable[[int, int], None] | None = None,
 ) -> TrainingResult:
@@ -121,8 +98,6 @@ def fit(
         dataset: Labelled recordings.
         split: Recordings of training, validation and test.
         rng: Source of the initial weights, the order of rows and dropout.
-        checkpoint: File for the state after each epoch.
-        resume: Continue from `checkpoint`.
         progress: Called after each epoch.
         advance: Called after each step with the rows done and the rows of all epochs.
 
@@ -134,9 +109,7 @@ def fit(
     with threadpool_limits(threads):  # the products of numpy and scipy
         torch.set_num_threads(threads)
         try:
-            return _fit(
-                config, dataset, split, rng, checkpoint, resume=resume, progress=progress, advance=advance
-            )
+            return _fit(config, dataset, split, rng, progress, advance)
         finally:
             torch.set_num_threads(before)
 
@@ -146,9 +119,6 @@ def _fit(
     dataset: Dataset,
     split: Split,
     rng: np.random.Generator,
-    checkpoint: Path | None,
-    *,
-    resume: bool,
     progress: Callable[[Epoch], None] | None,
     advance: Callable[[int, int], None] | None,
 ) -> TrainingResult:
@@ -161,6 +131,7 @@ def _fit(
             f"another file, or train with --model {'paper' if init.kind == 'mlp' else init.kind}"
         )
     device = device_of(config)
+    recordings = {recording.name: recording for recording in dataset.recordings}
     task = FitTask(
         features=config.inputs,
         train=data.rows["train"],
@@ -169,54 +140,35 @@ def _fit(
         validation_groups=data.groups["validation"],
         options=config.options,
         rng=rng,
-        recordings={recording.name: recording for recording in dataset.recordings},
+        recordings=recordings,
         init=init,
-        freeze=config.freeze,
         device=device,
-        checkpoint=checkpoint,
-        resume=resume,
         progress=progress,
         advance=advance,
     )
     fitted = PREDICTORS[config.kind].fit(task)
     predictor, labels = fitted.model, task.train.y
     mean, sd = float(labels.mean()), float(labels.std())
-    models = [predictor] if init is None else [predictor, init]
-    parts = tuple(_errors(data, part, models, mean)[0] for part in PARTS[1:])
-    path_of = {recording.name: recording.path for recording in dataset.recordings}
-    _, *paths = _errors(data, "test", models, mean, [path_of[name] for name in data.rows["test"].names])
-    predictor.residual_sd_nt = parts[-1].rmse_nt
-    predictor.metadata.update(_provenance(config, dataset, split, len(labels), device))
-    predictor.metadata.update(label_mean_nt=mean, label_sd_nt=sd)
-    if fitted.history:
-        kept = next(epoch for epoch in reversed(fitted.history) if epoch.best)
-        predictor.metadata.update(epochs_run=fitted.history[-1].number, epoch_kept=kept.number)
-    if fitted.choice:
-        predictor.metadata.update(
-            network="kept" if fitted.choice.kept else "left out",
-            base_validation_mae_nt=fitted.choice.base_mae_nt,
-            whole_validation_mae_nt=fitted.choice.whole_mae_nt,
-        )
-    for part in parts:
-        values = {"mae_nt": part.mae_nt, "naive_mae_nt": part.naive_mae_nt, "ridge_mae_nt": part.ridge_mae_nt}
-        predictor.metadata.update({f"{part.name}_{key}": value for key, value in values.items()})
-        if math.isfinite(part.coverage):
-            predictor.metadata[f"{part.name}_coverage_90"] = part.coverage
-    if (statistics := residuals(_held_out(data, fitted))) is not None:
-        predictor.metadata.update(statistics.metadata())
-    recordings = {recording.name: recording for recording in dataset.recordings}
+    parts = tuple(_errors(data, part, predictor, mean)[0] for part in PARTS[1:])
+    driven = [recordings[name].path for name in data.rows["test"].names]
+    _, *paths = _errors(data, "test", predictor, mean, driven)
     learned, tested = ([recordings[name] for name in split.names(part)] for part in ("train", "test"))
     sessions = dict.fromkeys(recording.session for recording in learned)
-    driven = dict.fromkeys(recording.path for recording in learned)
+    ways = dict.fromkeys(recording.path for recording in learned)
     plants = dict.fromkeys(recording.plant or NOMINAL for recording in learned)
+    predictor.residual_sd_nt = parts[-1].rmse_nt
+    predictor.metadata.update(_provenance(config, dataset, split, len(labels), device))
+    predictor.metadata.update(_outcome(fitted, parts))
+    predictor.metadata.update(
+        label_mean_nt=mean,
+        label_sd_nt=sd,
+        training_sessions=SEPARATOR.join(sessions),
+        training_paths=SEPARATOR.join(ways),
+    )
+    if (statistics := residuals(_held_out(data, fitted))) is not None:
+        predictor.metadata.update(statistics.metadata())
     if config.kind != "mixed" and set(plants) != {NOMINAL}:  # the mean of a mixed model is that of NOMINAL
         predictor.metadata["training_plants"] = SEPARATOR.join(plants)
-    predictor.metadata.update(
-        training_sessions=SEPARATOR.join(sessions), training_paths=SEPARATOR.join(driven)
-    )
-    judged_on = recordings_text(
-        len(tested), [test.session for test in tested], [test.path for test in tested], sessions, driven
-    )
     return TrainingResult(
         predictor=predictor,
         config=config,
@@ -228,8 +180,30 @@ def _fit(
         label_mean_nt=mean,
         label_sd_nt=sd,
         rows=len(labels),
-        judged_on=judged_on,
+        judged_on=recordings_text(
+            len(tested), [test.session for test in tested], [test.path for test in tested], sessions, ways
+        ),
     )
+
+
+def _outcome(fitted: Fit, parts: Sequence[PartErrors]) -> dict[str, MetadataValue]:
+    """Metadata about epochs, choice and errors."""
+    metadata: dict[str, MetadataValue] = {}
+    if fitted.history:
+        kept = next(epoch for epoch in reversed(fitted.history) if epoch.best)
+        metadata |= {"epochs_run": fitted.history[-1].number, "epoch_kept": kept.number}
+    if fitted.choice:
+        metadata |= {
+            "network": "kept" if fitted.choice.kept else "left out",
+            "base_validation_mae_nt": fitted.choice.base_mae_nt,
+            "whole_validation_mae_nt": fitted.choice.whole_mae_nt,
+        }
+    for part in parts:
+        names = ("mae_nt", "naive_mae_nt", "ridge_mae_nt")
+        metadata |= {f"{part.name}_{name}": getattr(part, name) for name in names}
+        if math.isfinite(part.coverage):
+            metadata[f"{part.name}_coverage_90"] = part.coverage
+    return metadata
 
 
 def device_of(config: TrainConfig) -> str:
@@ -239,9 +213,7 @@ def device_of(config: TrainConfig) -> str:
         InputError: The configuration asks for a GPU and torch has none.
     """
     if config.device == "cuda" and not torch.cuda.is_available():
-        raise InputError(
-            "device cuda: this torch sees no GPU; install one that does, or give --device cpu or auto"
-        )
+        raise InputError("device cuda: this torch sees no GPU; install one that does, or take `device=auto`")
     return "cuda" if config.device != "cpu" and torch.cuda.is_available() else "cpu"
 
 
@@ -260,14 +232,12 @@ def _held_out(data: TrainingData, fitted: Fit) -> list[HeldOut]:
 
 
 def _errors(
-    data: TrainingData, part: Part, models: Sequence[Predictor], mean: float, paths: Sequence[str] = ()
+    data: TrainingData, part: Part, model: Predictor, mean: float, paths: Sequence[str] = ()
 ) -> list[PartErrors]:
     """Errors on all rows of a part, then on those of each path; `paths` are those of its recordings."""
     rows = data.rows[part]
-    naive = mean - rows.y
-    ridge = data.ridge_of(part)[0] - rows.y
-    predicted = [model.predict(rows.x) for model in models]
-    errors = [values - rows.y for values, _ in predicted]
+    predicted, sd = model.predict(rows.x)
+    errors = (predicted - rows.y, mean - rows.y, data.ridge_of(part) - rows.y)
     masks = {str(part): np.ones(len(rows.y), bool)}
     for path in dict.fromkeys(paths):
         on_path = np.array([name == path for name in paths])[rows.recording]
@@ -278,14 +248,8 @@ def _errors(
             name,
             len(np.unique(rows.recording[mask])),
             int(mask.sum()),
-            _mae(errors[0][mask]),
-            _rmse(errors[0][mask]),
-            _mae(naive[mask]),
-            _rmse(naive[mask]),
-            _mae(ridge[mask]),
-            _rmse(ridge[mask]),
-            coverage(errors[0][mask], predicted[0][1][mask]),
-            _mae(errors[1][mask]) if len(errors) > 1 else math.nan,
+            *(size(error[mask]) for error in errors for size in (_mae, _rmse)),
+            coverage(errors[0][mask], sd[mask]),
         )
         for name, mask in masks.items()
     ]

@@ -15,7 +15,7 @@ from magtwin.learn.data.features import CIRCULAR, FEATURES
 from magtwin.learn.data.inputs import Array
 from magtwin.learn.data.recording import Recording, Rows
 from magtwin.learn.data.split import PARTS, Part, Split
-from magtwin.learn.models.linear import FittedLinear, fit_linear
+from magtwin.learn.models.linear import Linear, fit_linear
 from magtwin.report.summary import Summarized
 
 
@@ -30,19 +30,18 @@ class TrainingData(Summarized):
     """Session, recording or path of each row, by what the split keeps whole; shape (N,)."""
 
     @cached_property
-    def ridge(self) -> FittedLinear:
+    def _ridge(self) -> Linear:
         """Tolles and Lawson's terms by ridge regression on the training rows.
 
         The terms are heading harmonics, speed, turning, current and LiDAR, as far as the data set has them.
         An input that is nan counts as its mean.
         """
-        rows = self.rows["train"]
-        x = self._ridge_inputs("train")
-        return fit_linear(x, rows.y, self.groups["train"], features=ridge_terms(self.dataset), sd=rows.sd)
+        rows, x, terms = self.rows["train"], self._ridge_inputs("train"), ridge_terms(self.dataset)
+        return fit_linear(x, rows.y, self.groups["train"], features=terms, sd=rows.sd).model
 
-    def ridge_of(self, part: Part) -> tuple[Array, Array]:
-        """Predictions of the ridge for a part: disturbances and standard deviations [nT], each (N,)."""
-        return self.ridge.model.predict(self._ridge_inputs(part))
+    def ridge_of(self, part: Part) -> Array:
+        """Disturbances that this ridge predicts for a part [nT], shape (N,)."""
+        return self._ridge.predict(self._ridge_inputs(part))[0]
 
     def _ridge_inputs(self, part: Part) -> Array:
         """Inputs of the ridge; nan is filled with the mean of the training rows."""
