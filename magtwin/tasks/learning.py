@@ -37,7 +37,7 @@ from magtwin.learn.evaluation.candidates import (
 )
 from magtwin.learn.evaluation.evaluate import evaluate as judge
 from magtwin.learn.evaluation.evaluation import Evaluation
-from magtwin.learn.evaluation.trials import check_apart, trials_of, unlearned, unseen
+from magtwin.learn.evaluation.trials import trials_of, unlearned, unseen
 from magtwin.learn.inference.calibrate import calibrate as calibrate_model
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.inference.widen import widened
@@ -91,11 +91,7 @@ def build_dataset(
         InputError: A file cannot be read; two recordings have the same name; a recording has no poses, no
             field or no reading inside the map; all labels are equal; or the folder exists.
     """
-    if isinstance(runs, Mapping):
-        sources = sources_of(runs)
-    else:
-        sources = sources_of_files(runs, session_by=session_by, path_by=path_by, **reading)
-    checksum = ""
+    sources, checksum = _sources(runs, session_by=session_by, path_by=path_by, **reading), ""
     if not isinstance(anomaly_map, AnomalyMap):
         from magtwin.usd.layers import layer_sha256
 
@@ -314,9 +310,8 @@ def widen(
     if isinstance(model, str | os.PathLike):
         path = existing(model, "weights file")
         model, card, before = load_predictor(path), path.with_suffix(".md"), sha256(path)
-    sources = sources_of(recordings) if isinstance(recordings, Mapping) else sources_of_files(recordings)
     field = anomaly_map if isinstance(anomaly_map, AnomalyMap) else open_map(anomaly_map)
-    wide = widened(model, sources, field)
+    wide = widened(model, _sources(recordings), field)
     if out is not None:
         with transaction():
             with output(out, force=force) as weights:
@@ -421,16 +416,18 @@ def _trials(
     """Recordings to judge by, and the training recordings that baselines are fitted to."""
     learned: Sequence[str] = () if learning is None else learning.names
     is_set = isinstance(recordings, str | os.PathLike) and (Path(recordings) / MANIFEST).is_file()
-    if not (isinstance(recordings, Dataset) or is_set):
-        if isinstance(recordings, Mapping):
-            trials = [Source(name, lambda run=run: run) for name, run in recordings.items()]  # type: ignore[misc]
-        else:
-            trials = sources_of_files(recordings)  # type: ignore[arg-type]
-        return trials if learning is None else unlearned(trials, learning), learned
-    judged = _dataset(recordings)  # type: ignore[arg-type]
-    names, rest = unseen(judged, candidates)
-    if learning is not None:
-        if learning.folder.resolve() == judged.folder.resolve():
+    if isinstance(recordings, Dataset) or is_set:
+        judged = _dataset(recordings)  # type: ignore[arg-type]
+        names, rest = unseen(judged, candidates)
+        if learning is not None and learning.folder.resolve() == judged.folder.resolve():
             learned = tuple(name for name in rest if name not in names)
-        check_apart(learning, learned, judged, names)
-    return trials_of(judged, names), learned
+        trials = trials_of(judged, names)
+    else:
+        trials = _sources(recordings)
+    return trials if learning is None else unlearned(trials, learning, learned), learned
+
+
+def _sources(recordings: Mapping[str, Run] | Sequence[File] | File, **options: Any) -> list[Source]:
+    return (
+        sources_of(recordings) if isinstance(recordings, Mapping) else sources_of_files(recordings, **options)
+    )

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.learn.data.dataset import Dataset, open_dataset
+from magtwin.learn.data.features import feature_names
 from magtwin.report.report import Figure, Report
 from magtwin.report.summary import Summarized
 
@@ -53,9 +54,7 @@ class Correlations(Summarized):
         return Report(title, tuple(figures), {"rows": self.rows, "groups": self.groups, "method": method})
 
 
-def correlations(
-    x: ArrayLike, y: ArrayLike, features: Sequence[str], groups: ArrayLike | None = None
-) -> Correlations:
+def correlations(x: ArrayLike, y: ArrayLike, features: Sequence[str], groups: ArrayLike) -> Correlations:
     """Spearman's correlation of each input with the label: Pearson's of their ranks (Spearman 1904).
 
     Readings of a run are correlated, so the spread is the jackknife's over groups:
@@ -66,25 +65,16 @@ def correlations(
         x: Inputs, shape (N, F).
         y: Labels [nT], shape (N,).
         features: Names of the inputs, F of them.
-        groups: Recording or session of each row, whole numbers, shape (N,). Default: one group.
+        groups: Recording or session of each row, whole numbers, shape (N,).
 
     Raises:
-        InputError: Shapes do not fit, a value is not finite, there are fewer than three rows, or the
-            label never varies.
+        InputError: There are fewer than three rows, or the label never varies.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
-    if x.ndim != 2 or x.shape != (len(y), len(features)):
-        raise InputError(f"x must have shape {(len(y), len(features))}, a row a label, got {x.shape}")
-    if len(y) < 3 or not (np.isfinite(x).all() and np.isfinite(y).all()):
-        raise InputError(f"correlations need three rows at least, all finite, got {len(y)}")
-    group = np.zeros(len(y), int) if groups is None else np.asarray(groups)
-    if group.shape != y.shape:
-        raise InputError(f"groups must have shape {y.shape}, got {group.shape}")
-    group = np.unique(group, return_inverse=True)[1]
-    b = _ranks(y)
-    if not b.any():
+    group, b = np.unique(groups, return_inverse=True)[1], _ranks(y)
+    if len(y) < 3 or not b.any():
         raise InputError(
-            f"every label is {y[0]:g} nT: there is nothing to correlate with; were they made right?"
+            f"{len(y)} labels of {y[0]:g} nT and more: too few or all alike, so nothing correlates with them"
         )
     count = int(group.max()) + 1
     rho, sd = np.full(len(features), np.nan), np.full(len(features), np.nan)
@@ -117,12 +107,12 @@ def correlations_of(
         InputError: As for `correlations`, or the recordings lack a column of a feature.
     """
     dataset = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
-    rows = dataset.rows(features)
+    names, rows = feature_names(features), dataset.rows(features)
     sessions = [dataset.recording(name).session for name in rows.names]
     keys = rows.names if len(set(sessions)) < 2 else sessions
     number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
     groups = np.array([number[key] for key in keys])[rows.recording]
-    return correlations(rows.x, rows.y, rows.features, groups)
+    return correlations(rows.x, rows.y, names, groups)
 
 
 def _ranks(values: Array) -> Array:

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError, find
 from magtwin.learn.data.recording import Recording
-from magtwin.report.report import Figure, Report
-from magtwin.report.summary import Summarized, Summary, listed
+from magtwin.report.summary import Summarized
 
 By = Literal["session", "run", "path", "row"]
 Part = Literal["train", "validation", "test"]
@@ -98,23 +97,6 @@ class Split(Summarized):
         edges = np.cumsum((0.0, *self.row_shares))
         i = PARTS.index(part)
         return (drawn >= edges[i]) & (drawn < (edges[i + 1] if part != "test" else 2.0))
-
-    def report(self, title: str = "Split") -> Report:
-        """Number of recordings of each part, and the warning."""
-        figures = [Figure(part, len(self.names(part)), "recordings") for part in PARTS]
-        metadata: dict[str, object] = {"by": self.by}
-        if self.leak:
-            metadata["warning"] = self.leak
-        return Report(title, tuple(figures), metadata)
-
-    def _summary(self) -> Summary:
-        return Summary(
-            f"Split by {self.by}",
-            (
-                *((part, f"{len(self.names(part)):,}: {listed(self.names(part), 70)}") for part in PARTS),
-                ("caution", self.leak),
-            ),
-        )
 
 
 def split(

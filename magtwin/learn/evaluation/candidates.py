@@ -17,7 +17,7 @@ from magtwin.learn.data.origin import same_map
 from magtwin.learn.evaluation.training_rows import alignment_on, training_rows
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer, Read
 from magtwin.learn.models.linear import fit_linear
-from magtwin.report.summary import Summarized, Summary, listed
+from magtwin.report.summary import Summarized
 from magtwin.run.run import Run
 
 NAIVE = "naive"  # Name of the naive model
@@ -87,16 +87,6 @@ class Candidate(Summarized):
     alignment: Alignment = field(default_factory=Alignment)
     metadata: Mapping[str, Any] = field(default_factory=dict)
     """Metadata of its file, or how it was fitted."""
-
-    def _summary(self) -> Summary:
-        (x, y), latency = self.alignment.lever_arm_m, self.alignment.latency_s
-        return Summary(
-            f"Candidate {self.name}: on map {self.map.name}",
-            (
-                ("inputs", f"{len(self.model.features)}: {listed(self.model.features)}"),
-                ("alignment", f"lever arm ({x:.3g}, {y:.3g}) m, latency {latency:.3g} s"),
-            ),
-        )
 
 
 def candidate_of(

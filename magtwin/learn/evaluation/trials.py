@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,13 +70,13 @@ def unseen(dataset: Dataset, candidates: Sequence[Candidate]) -> tuple[tuple[str
     return tuple(names), tuple(learned)
 
 
-def unlearned(trials: Sequence[Source], dataset: Dataset, names: Sequence[str] | None = None) -> list[Source]:
+def unlearned(trials: Sequence[Source], dataset: Dataset, names: Sequence[str]) -> list[Source]:
     """Recordings that refuse to be read if a training set holds them, under any name.
 
     Args:
         trials: Recordings to judge by.
         dataset: Training recordings, possibly thinned.
-        names: Which of them. Default: all.
+        names: Which of them.
     """
     learned: dict[tuple[bytes, bytes], list[tuple[str, Array, Array]]] = {}
     for recording, run in dataset.runs(names):
@@ -104,23 +103,3 @@ def unlearned(trials: Sequence[Source], dataset: Dataset, names: Sequence[str] |
 def _first(t: Array, b: Array) -> tuple[bytes, bytes]:
     """First time and first reading of a recording; thinning keeps both."""
     return t[:1].tobytes(), np.nan_to_num(b[:1], nan=np.inf).tobytes()
-
-
-def check_apart(train: Dataset, names: Sequence[str], judged: Dataset, of: Sequence[str]) -> None:
-    """Refuse to judge baselines by recordings that they are fitted to.
-
-    Raises:
-        InputError: A recording is on both sides, by name, session, path and length.
-    """
-
-    def known(dataset: Dataset, kept: Sequence[str]) -> set[tuple[Any, ...]]:
-        recordings = [dataset.recording(name) for name in kept]
-        return {(each.name, each.session, each.path, each.rows, each.duration_s) for each in recordings}
-
-    both = known(train, names) & known(judged, of)
-    if both:
-        name = sorted(key[0] for key in both)[0]
-        raise InputError(
-            f"{name!r} and {len(both) - 1} more recordings of {judged.folder} are in {train.folder} too, "
-            "which baselines learn from; judge by others"
-        )
