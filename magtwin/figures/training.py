@@ -65,7 +65,7 @@ def write_learning_curve(
         aside.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def draw_correlations(correlations: Correlations, *, title: str = "") -> Figure:
+def draw_correlations(correlations: Correlations) -> Figure:
     """Draw the correlation of each input with the disturbance, beside the paper's values."""
     names, count = correlations.features, len(correlations.features)
     figure = new_figure(WIDTH_IN, 1.5 + 0.24 * count)
@@ -90,6 +90,5 @@ def draw_correlations(correlations: Correlations, *, title: str = "") -> Figure:
     label(ax, "Spearman's correlation with the disturbance")
     ax.grid(axis="x", color="0.9")
     ax.set_axisbelow(True)
-    ax.set_title(title, fontsize=10)
     legend_below(figure)
     return figure

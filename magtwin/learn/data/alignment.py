@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
@@ -21,7 +20,6 @@ Array = NDArray[np.float64]
 UNUSABLE = ("flag_lost_lock", "flag_pose_lost")  # Flags of a run whose readings have no label
 BLOCK_S = 5.0  # Length of blocks of readings with correlated errors [s]
 TILES = 4  # Number of tiles along each side of the driven area; errors of the map and platform stay in place
-DEGREE = 1  # Degree of the fields of the platform that vary over the driven area
 LATENCIES_S = np.arange(-0.4, 0.41, 0.02)  # Latencies that are tried before the best are refined [s]
 END_S = 0.5  # Time at each end of a run that a latency is not fitted to [s]; no pose may lie beyond
 LEAST_ROWS = 200  # Least number of labelled readings for a fit
@@ -149,8 +147,8 @@ def fit_alignment(
     returned. The platform terms are fixed to the robot and depend on its heading: iron, turning, speed, their
     rates, LiDAR and battery current. Without them iron would pass for a lever arm, and the motors' torque
     before a turn for a latency. A robot whose iron has changed since the survey also adds a field that varies
-    with the direction of the lab's field, so polynomials of the place, of degree `DEGREE`, times constant,
-    sine and cosine of the heading are fitted too. On a straight line at one speed a forward lever arm and a
+    with the direction of the lab's field, so both coordinates of the place, times constant, sine and cosine
+    of the heading, are fitted too. On a straight line at one speed a forward lever arm and a
     latency are the same, so both have a weak prior of covariance P around 0. The estimate is G times that of
     least squares, G = P (P + V)^-1, with V from blocks of `BLOCK_S` with correlated errors.
 
@@ -389,10 +387,8 @@ def _platform(run: Run, rows: NDArray[np.intp], yaw: Array, rates: Array) -> Arr
 
 def _over_the_area(unit: Array, yaw: Array) -> Array:
     """Columns (M, K) for fields that vary slowly with the place, -1 to 1 along each axis, by heading."""
-    x, y = (legvander(u, DEGREE) for u in unit.T)
     ways = (np.ones(len(yaw)), np.cos(yaw), np.sin(yaw))
-    shapes = [x[:, i] * y[:, j] for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j]
-    return np.column_stack([shape * way for shape in shapes for way in ways])
+    return np.column_stack([shape * way for shape in (unit[:, 1], unit[:, 0]) for way in ways])
 
 
 def _slope(values: Array, t: Array, at: Array) -> Array:

@@ -1,6 +1,5 @@
 """Rank correlation of each input with the disturbance, as in the paper's Figure 2."""
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -9,9 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.learn.data.dataset import Dataset, open_dataset
-from magtwin.learn.data.features import feature_names
-from magtwin.report.report import Figure, Report
 from magtwin.report.summary import Summarized
 
 Array = NDArray[np.float64]
@@ -40,18 +36,6 @@ class Correlations(Summarized):
 
     groups: int
     """Number of recordings or sessions."""
-
-    def report(self, title: str = "Correlation with the disturbance") -> Report:
-        """Every input with its correlation, its spread, and the paper's correlation."""
-        figures = []
-        for name, rho, sd in zip(self.features, self.rho.tolist(), self.sd.tolist(), strict=True):
-            paper = f"the paper {PAPER[name]:+.2f}" if name in PAPER else ""
-            if np.isnan(rho):
-                figures.append(Figure(name, "never varies"))
-            else:
-                figures.append(Figure(name, round(rho, 4), "", None if np.isnan(sd) else round(sd, 4), paper))
-        method = "Spearman's rank correlation, ties at their mean rank; spread by leaving out groups"
-        return Report(title, tuple(figures), {"rows": self.rows, "groups": self.groups, "method": method})
 
 
 def correlations(x: ArrayLike, y: ArrayLike, features: Sequence[str], groups: ArrayLike) -> Correlations:
@@ -91,28 +75,6 @@ def correlations(x: ArrayLike, y: ArrayLike, features: Sequence[str], groups: Ar
             without = _pearson(total - sums)
             sd[i] = np.sqrt((count - 1) / count * np.sum((without - without.mean()) ** 2))
     return Correlations(tuple(features), rho, sd, len(y), count)
-
-
-def correlations_of(
-    dataset: Dataset | str | os.PathLike[str], features: str | Sequence[str] = "full"
-) -> Correlations:
-    """Correlations of a data set's inputs with its labels, grouped by session, or by recording if there is
-    one.
-
-    Args:
-        dataset: The data set, or its folder.
-        features: A set of features, or their names.
-
-    Raises:
-        InputError: As for `correlations`, or the recordings lack a column of a feature.
-    """
-    dataset = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
-    names, rows = feature_names(features), dataset.rows(features)
-    sessions = [dataset.recording(name).session for name in rows.names]
-    keys = rows.names if len(set(sessions)) < 2 else sessions
-    number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
-    groups = np.array([number[key] for key in keys])[rows.recording]
-    return correlations(rows.x, rows.y, names, groups)
 
 
 def _ranks(values: Array) -> Array:

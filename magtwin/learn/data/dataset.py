@@ -269,7 +269,8 @@ class Dataset(Summarized):
         paths = sorted({recording.path for recording in self.recordings})
         sessions = {recording.session for recording in self.recordings}
         return Summary(
-            f"Dataset {self.folder.name}: {len(self.recordings):,} recordings, {rows:,} rows, {minutes:.4g} min",
+            f"Dataset {self.folder.name}: {len(self.recordings):,} recordings, {rows:,} rows, "
+            f"{minutes:.4g} min",
             (
                 ("from", f"{len(sessions):,} sessions, {len(paths):,} paths: {listed(paths)}"),
                 ("map", f"{self.map_name}; lever arm ({x:.3g}, {y:.3g}) m, latency {latency:.3g} s"),
@@ -306,24 +307,9 @@ def build_dataset(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Dataset:
-    """Label recordings on a map and write them as a data set; `magtwin.tasks.learning` takes files.
+    """Label recordings on a map and write them as a data set: `magtwin.build_dataset` for sources.
 
-    Args:
-        recordings: Runs by name, or sources that are read one at a time.
-        field: The map.
-        folder: Folder to make.
-        alignment: Lever arm and latency; "fit" fits them to all recordings. None uses pose and reading as
-            they are.
-        map_sha256: Checksum of the map's file. Default: that of its values.
-        rate_hz: Highest rate of readings to keep [Hz]. Default: all.
-        jobs: Processes that share the recordings; they do not change the data set. Default: this process,
-            with several threads.
-        force: Replace an existing folder.
-        progress: Called with the recordings done, their number, and the name of the next.
-
-    Raises:
-        InputError: There is no recording, two have one name, one has no label on the map, lacks a pose or a
-            field, all labels are the same, or the folder exists.
+    `map_sha256` is the checksum of the map's file; default: that of its values.
     """
     sources = sources_of(recordings)
     report = progress or (lambda done, total, what: None)

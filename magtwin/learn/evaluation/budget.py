@@ -32,9 +32,8 @@ from magtwin.learn.data.alignment import Alignment, placed
 from magtwin.learn.data.dataset import Dataset
 from magtwin.learn.data.features import CARRIED, CIRCULAR, FEATURES, GRADIENT, features
 from magtwin.learn.data.labels import labelled
-from magtwin.learn.evaluation.candidates import Candidate, Mean
+from magtwin.learn.evaluation.candidates import Candidate, Mean, aligned_runs
 from magtwin.learn.evaluation.evaluation import Evaluation
-from magtwin.learn.evaluation.training_rows import aligned_runs
 from magtwin.report.summary import Summarized
 from magtwin.run.run import Run
 from magtwin.sim.interference import level_field_nt, platform_field_nt, sensor_places

@@ -2,25 +2,32 @@
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.alignment import Alignment, alignment_of
 from magtwin.learn.data.dataset import Dataset, values_sha256
-from magtwin.learn.data.features import CARRIED, CIRCULAR, FEATURES, GRADIENT
+from magtwin.learn.data.features import CARRIED, CIRCULAR, FEATURES, GRADIENT, features
+from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.origin import same_map
-from magtwin.learn.evaluation.training_rows import alignment_on, training_rows
+from magtwin.learn.data.recording import thinned
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer, Read
 from magtwin.learn.models.linear import fit_linear
 from magtwin.report.summary import Summarized
 from magtwin.run.run import Run
 
+Array = NDArray[np.float64]
+
 NAIVE = "naive"  # Name of the naive model
+
+TRAINED_AT_HZ = 10.0
+"""Highest rate of training rows of a baseline [Hz]; nearer rows are too alike to add information."""
 
 
 class Model(Protocol):
@@ -144,8 +151,8 @@ def naive(
         InputError: The mean is not known.
     """
     if dataset is not None:
-        alignment = alignment_on(dataset, named.checksums)
-        labels = training_rows(dataset, names, named.field, (), alignment)[1]
+        alignment = _alignment_on(dataset, named.checksums)
+        labels = _training_rows(dataset, names, named.field, (), alignment)[1]
         model = Mean(float(labels.mean()), float(labels.std()))
         return Candidate(NAIVE, model, named, alignment, {"fitted to": dataset.folder.name})
     for candidate in weights:
@@ -185,11 +192,11 @@ def tolles_lawson(
         InputError: A recording has no label on the map.
     """
     given = alignment is not None
-    alignment = alignment or alignment_on(dataset, named.checksums)
+    alignment = alignment or _alignment_on(dataset, named.checksums)
     wanted = (*CIRCULAR, *GRADIENT, *CARRIED) if gradient else CIRCULAR
     able = set(dataset.columns) | {"yaw", "b_map_gradient_nt_m"}
     inputs = tuple(name for name in wanted if set(FEATURES[name].columns) <= able)
-    x, y, sd, session = training_rows(dataset, names, named.field, inputs, alignment)
+    x, y, sd, session = _training_rows(dataset, names, named.field, inputs, alignment)
     model = fit_linear(x, y, session, features=inputs, sd=sd).model
     kind = "Tolles-Lawson and gradient" if gradient else "Tolles-Lawson"
     about = {"fitted to": dataset.folder.name, "penalty": model.penalty, "training rows": len(y)}
@@ -224,3 +231,44 @@ def tolles_lawson_variants(
         aligned = variants[-1].alignment if variants[-1].alignment in fitted else None
         variants.append(tolles_lawson(named, dataset, names, gradient=True, alignment=aligned))
     return variants
+
+
+def _training_rows(
+    dataset: Dataset,
+    names: Sequence[str] | None,
+    anomaly_map: AnomalyMap,
+    inputs: Sequence[str],
+    alignment: Alignment,
+) -> tuple[Array, Array, Array, NDArray[np.intp]]:
+    """Inputs (N, F), labels and standard deviations of the map [nT], and sessions (N,) of recordings."""
+    parts = []
+    sessions = [recording.session for recording in dataset.recordings]
+    for name, run in aligned_runs(dataset, names, anomaly_map, alignment):
+        x, y = features(run, inputs), run["label_nt"]
+        known = np.isfinite(y) & np.isfinite(x).all(axis=1)
+        number = sessions.index(dataset.recording(name).session)
+        parts.append((x[known], y[known], run["label_sd_nt"][known], np.full(int(known.sum()), number)))
+    x, y, sd, session = (np.concatenate(column) for column in zip(*parts, strict=True))
+    if not len(y):
+        raise InputError(
+            f"{dataset.folder}: no training row has a label on {anomaly_map.name} and all inputs"
+        )
+    return x, y, sd, session
+
+
+def aligned_runs(
+    dataset: Dataset, names: Sequence[str] | None, anomaly_map: AnomalyMap, alignment: Alignment
+) -> Iterator[tuple[str, Run]]:
+    """Names and runs of training recordings, at most `TRAINED_AT_HZ` rows a second, labelled on a map."""
+    for recording, run in dataset.runs(names):
+        try:
+            yield recording.name, labelled(thinned(run, TRAINED_AT_HZ), anomaly_map, alignment)
+        except InputError as error:
+            raise InputError(f"{dataset.folder}, {recording.name}: {error}") from error
+
+
+def _alignment_on(dataset: Dataset, checksums: Collection[str]) -> Alignment:
+    """Lever arm and latency of a data set that was labelled on a map with one of these checksums, else 0."""
+    if dataset.map_sha256 not in checksums:
+        return Alignment()
+    return Alignment(dataset.alignment.lever_arm_m, dataset.alignment.latency_s)

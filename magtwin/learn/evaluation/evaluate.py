@@ -33,16 +33,7 @@ def evaluate(
     truth: bool = False,
     progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
 ) -> Evaluation:
-    """Judge models by recordings.
-
-    Args:
-        candidates: The models.
-        trials: The recordings.
-        baseline: The model that the others are compared with, such as `naive`.
-        rng: Source of the draws of the intervals.
-        cases: Paths by row of the table, beside the paper's A to E. Default: a path is its own row.
-        truth: Compare with the exact field b_truth_nt instead of the reading.
-        progress: Called with the recordings done, their number, and the name of the next.
+    """Judge models by recordings: `magtwin.evaluate` for candidates and sources.
 
     Raises:
         InputError: There is no recording, two models or two recordings have one name, a recording lacks a

@@ -118,26 +118,13 @@ def calibrate(
     parent: Mapping[str, MetadataValue] | None = None,
     name: str = "",
 ) -> Mixed:
-    """Calibrate a mixed model by a labelled drive; see `magtwin.calibrate`.
+    """Calibrate a mixed model by a labelled drive: `magtwin.calibrate` for a model and a run.
 
-    Args:
-        model: A mixed model.
-        run: The drive.
-        field: The map that the model was trained on.
-        duration_s: Length of the part to use, from the start [s]. Default: all.
-        pose_sd_m: Standard deviation of the drive's positions, each axis [m].
-        pose_from_map: Whether the poses were estimated on the map.
-        parent: Metadata about the file of the model.
-        name: Name of the drive, for the metadata.
-
-    Raises:
-        InputError: The model is of another kind, or the drive has too few labelled readings.
+    `parent` is metadata about the file of the model, `name` that of the drive.
     """
     what = name or "the drive"
     model = mixed_of_kind(model)
-    if not 0 <= pose_sd_m <= MOST_SD_M:
-        most = f", at most {MOST_SD_M:g} m" if pose_sd_m > MOST_SD_M else ""
-        raise InputError(f"pose_sd_m must be 0 or more and finite{most}, got {pose_sd_m!r}")
+    check_pose_sd(pose_sd_m)
     if duration_s is not None and not 0 < duration_s < math.inf:
         raise InputError(f"duration_s must be above 0 s and finite, got {duration_s!r}")
     drive = labelled_drive(model, run, field, name=what)
@@ -199,6 +186,12 @@ def mixed_of_kind(model: Predictor) -> Mixed:
             f"a model of the kind {model.kind!r} has no effects of a session; train one with --model mixed"
         )
     return model
+
+
+def check_pose_sd(pose_sd_m: float) -> None:
+    """Refuse a standard deviation of positions below 0, or above `MOST_SD_M`."""
+    if not 0 <= pose_sd_m <= MOST_SD_M:
+        raise InputError(f"pose_sd_m must be between 0 and {MOST_SD_M:g} m, got {pose_sd_m!r}")
 
 
 def _cautions(drive: LabelledDrive, run: Run, *, pose_from_map: bool) -> list[str]:

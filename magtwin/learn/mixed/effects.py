@@ -106,17 +106,9 @@ def posterior(prior: Effects, sums: Sums) -> Effects:
     return Effects(covariance @ (precision @ prior.mean + sums.sloped), covariance)
 
 
-@dataclass(frozen=True)
-class FittedEffects:
-    """A prior of effects, and the factor s^2 of the variances that the sums were made with."""
-
-    prior: Effects
-    factor: float
-
-
 def fit_effects(
     sessions: Sequence[Sums], mean: Array, *, start_nt2: Array, rounds: int = ROUNDS
-) -> FittedEffects:
+) -> tuple[Effects, float]:
     """Fit Lambda and the noise factor to sessions by EM; mu stays as given.
 
     The E-step is the posterior of each session under N(mu, Lambda) and variances s^2 v. The M-step is
@@ -131,6 +123,9 @@ def fit_effects(
         mean: mu [nT], shape (P,).
         start_nt2: Variances of the effects to start from [nT^2], shape (P,).
         rounds: Most rounds.
+
+    Returns:
+        The prior of effects, and the factor s^2 of the variances.
     """
     curved, sloped = np.stack([s.curved for s in sessions]), np.stack([s.sloped for s in sessions])
     square, count = sum(s.square for s in sessions), sum(s.count for s in sessions)
@@ -152,4 +147,4 @@ def fit_effects(
         now = factor, np.trace(covariance)
         if all(abs(a - b) <= SETTLED * b for a, b in zip(now, before, strict=True)):
             break
-    return FittedEffects(Effects(np.asarray(mean, float), covariance), factor)
+    return Effects(np.asarray(mean, float), covariance), factor

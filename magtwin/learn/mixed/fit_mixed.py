@@ -137,9 +137,9 @@ class _Fitter:
         chosen = [i for i, drive in enumerate(self.drives) if drive.learned and i not in left]
         sums: list[Sums] = [self.sums[i] for i in chosen]
         start = np.full(len(self.model.prior.mean), self._start_nt2(chosen))
-        fitted = fit_effects(sums, self.model.prior.mean, start_nt2=start)
-        noise = self.model.noise.scaled(math.sqrt(fitted.factor))
-        return replace(self.model, prior=fitted.prior, session=fitted.prior, noise=noise)
+        prior, factor = fit_effects(sums, self.model.prior.mean, start_nt2=start)
+        noise = self.model.noise.scaled(math.sqrt(factor))
+        return replace(self.model, prior=prior, session=prior, noise=noise)
 
     def factors(self) -> dict[str, float]:
         """Factors of standard deviations, from sessions whose plant was left out of the fit."""

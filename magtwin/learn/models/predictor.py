@@ -180,30 +180,6 @@ class Epoch:
     """Whether no earlier epoch has a smaller val_rmse_nt; the last such epoch is kept."""
 
 
-@dataclass(frozen=True)
-class Choice:
-    """Whether a hybrid keeps its network, by mean absolute errors on the validation rows [nT]."""
-
-    base_mae_nt: float
-    """Of the base alone."""
-
-    whole_mae_nt: float
-    """Of base and network."""
-
-    @property
-    def kept(self) -> bool:
-        """Whether the network lowers the error."""
-        return self.whole_mae_nt < self.base_mae_nt
-
-    def text(self) -> str:
-        """The decision and its reason, in a sentence."""
-        decision = "is kept" if self.kept else "is left out, the base alone remains"
-        return (
-            f"on the validation recordings the base alone errs by {self.base_mae_nt:.1f} nT, with the "
-            f"network by {self.whole_mae_nt:.1f} nT: the network {decision}"
-        )
-
-
 @dataclass(frozen=True, kw_only=True)
 class FitTask:
     """Everything that fitting a predictor needs."""
@@ -253,9 +229,6 @@ class Fit:
 
     history: tuple[Epoch, ...] = ()
     """Its epochs; empty if it is fitted at once."""
-
-    choice: Choice | None = None
-    """Of a hybrid."""
 
     held_out_nt: Array | None = None
     """Disturbance at each training row by a fit without its group [nT], shape (N,); of a hybrid, by its base.

@@ -11,7 +11,7 @@ from magtwin.learn.models.calibration import transferred_factor, yardstick
 from magtwin.learn.models.hybrid import Hybrid, hybrid_of
 from magtwin.learn.models.linear import FittedLinear, Linear, fit_linear, linear_of
 from magtwin.learn.models.network import FieldNet, net_of
-from magtwin.learn.models.predictor import Array, Choice, Epoch, Fit, FitTask
+from magtwin.learn.models.predictor import Array, Epoch, Fit, FitTask
 
 DESCENT: Mapping[str, Any] = MappingProxyType({"epochs": 20, "batch": 1024, "lr": 1e-3, "patience": None})
 TORCH: Mapping[str, Any] = MappingProxyType({"threads": None, "device": "auto"})
@@ -68,7 +68,7 @@ class Hybrids:
         inputs = base.model.inputs
         residual = learned.y - base.model.predict(learned.x)[0]
         base_mean, base_sd = base.model.predict(stops.x)
-        model, choice = Hybrid(base=base.model, net=None), None
+        model = Hybrid(base=base.model, net=None)
         history: tuple[Epoch, ...] = ()
         if residual.std() > 1e-9:
             net, history = _train(
@@ -81,13 +81,19 @@ class Hybrids:
                 init=None if init is None else init.net,
             )
             whole = Hybrid(base=base.model, net=net)
-            errors = (base_mean - stops.y, whole.predict(stops.x)[0] - stops.y)
-            choice = Choice(*(float(np.mean(np.abs(error))) for error in errors))
-            model = whole if choice.kept else model
+            predictions = (base_mean, whole.predict(stops.x)[0])
+            of_base, of_whole = (float(np.mean(np.abs(mean - stops.y))) for mean in predictions)
+            kept = of_whole < of_base
+            model = whole if kept else model
+            model.metadata = {
+                "network": "kept" if kept else "left out",
+                "base_validation_mae_nt": of_base,
+                "whole_validation_mae_nt": of_whole,
+            }
         error = model.predict(stops.x)[0] - stops.y
         reference = _yardstick(task, base, base_mean, base_sd)
         model.sd_factor = transferred_factor(error, base_sd, task.validation_groups, reference)
-        return Fit(model, history, choice, _left_out(base))
+        return Fit(model, history, _left_out(base))
 
 
 def _train(

@@ -71,13 +71,13 @@ def _data(result: TrainingResult) -> str:
     names = ", ".join(split.test[:MOST_NAMES])
     names += f" and {len(split.test) - MOST_NAMES} more" if len(split.test) > MOST_NAMES else ""
     dataset, field = (_plain(str(metadata[key])) for key in ("dataset", "map"))
-    label = f"{result.label_mean_nt:.1f} +- {result.label_sd_nt:.1f} nT"
+    label = f"{metadata['label_mean_nt']:.1f} +- {metadata['label_sd_nt']:.1f} nT"
     points = (
         f"Data set `{dataset}`, SHA-256 of its manifest `{metadata['dataset_sha256']}`.",
         f"Labelled on the map `{field}`, SHA-256 `{metadata['map_sha256']}`: measured field minus map, "
         f"at a lever arm of {metadata['lever_arm_m']} m and a latency of {metadata['latency_s']:g} s "
         f"(standard deviations {metadata['lever_arm_sd_m']} m and {metadata['latency_sd_s']:g} s).",
-        f"{result.rows:,} training rows, labels {label}.",
+        f"{metadata['training_rows']:,} training rows, labels {label}.",
         f"Recordings split by {split.by}: {counts}.",
         f"Test: {names}.",
     )
@@ -86,11 +86,15 @@ def _data(result: TrainingResult) -> str:
 
 def _how(result: TrainingResult) -> str:
     """The columns of the table, and what validation was used for."""
-    best, chosen = result.best, "Validation calibrated the intervals; "
-    if best is not None:
-        chosen = f"Validation chose the epoch, {best.number} of {result.history[-1].number}; "
-    if result.choice:
-        chosen += f"{result.choice.text()}; "
+    told, chosen = result.predictor.metadata, "Validation calibrated the intervals; "
+    if result.history:
+        chosen = f"Validation chose the epoch, {told['epoch_kept']} of {told['epochs_run']}; "
+    if "network" in told:
+        decision = "is kept" if told["network"] == "kept" else "is left out, the base alone remains"
+        chosen += (
+            f"on the validation recordings the base alone errs by {told['base_validation_mae_nt']:.1f} nT, "
+            f"with the network by {told['whole_validation_mae_nt']:.1f} nT: the network {decision}; "
+        )
     return (
         "Of the total field at the sensor [nT]. Naive: the mean training label on every row. Ridge: Tolles "
         "and Lawson's terms (heading harmonics, speed, turning, current, LiDAR) by ridge regression on the "

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from magtwin.learn.data.split import Split
-from magtwin.learn.models.predictor import Choice, Epoch, Predictor
+from magtwin.learn.models.predictor import Epoch, Predictor
 from magtwin.learn.models.weights import shown
 from magtwin.learn.training.config import TrainConfig
 from magtwin.report.report import Figure, Report
@@ -51,9 +51,6 @@ class TrainingResult(Summarized):
     history: tuple[Epoch, ...]
     """Its epochs; empty if it is fitted at once."""
 
-    choice: Choice | None
-    """Whether a hybrid keeps its network; None for other kinds."""
-
     split: Split
 
     parts: tuple[PartErrors, ...]
@@ -61,15 +58,6 @@ class TrainingResult(Summarized):
 
     paths: tuple[PartErrors, ...]
     """Errors on the test by path."""
-
-    label_mean_nt: float
-    """Mean of the training labels [nT]: the naive prediction."""
-
-    label_sd_nt: float
-    """Their standard deviation [nT]."""
-
-    rows: int
-    """Training rows."""
 
     judged_on: str
     """The test recordings in words, and how many of their sessions and paths are new."""
@@ -85,18 +73,18 @@ class TrainingResult(Summarized):
             Figure("kind", self.predictor.kind),
             Figure("layers", self.predictor.layers_text),
             Figure("parameters", self.predictor.parameters_count),
-            Figure("training rows", self.rows),
+            Figure("training rows", self.predictor.metadata["training_rows"]),
         ]
         if (best := self.best) is not None:
             figures += [
                 Figure("epochs", self.history[-1].number, note=f"kept {best.number}"),
                 Figure("training RMSE", best.train_rmse_nt, "nT", note=f"in epoch {best.number}"),
             ]
-        if self.choice:
+        if "network" in (told := self.predictor.metadata):
             figures += [
-                Figure("base alone MAE", self.choice.base_mae_nt, "nT", note="on validation"),
-                Figure("with network MAE", self.choice.whole_mae_nt, "nT", note="on validation"),
-                Figure("network", "kept" if self.choice.kept else "left out: the base alone does better"),
+                Figure("base alone MAE", told["base_validation_mae_nt"], "nT", note="on validation"),
+                Figure("with network MAE", told["whole_validation_mae_nt"], "nT", note="on validation"),
+                Figure("network", told["network"]),
             ]
         for errors in self.parts:
             figures += [
@@ -119,19 +107,12 @@ class TrainingResult(Summarized):
         )
 
     def _summary(self) -> Summary:
-        scores = [
+        rows = [
             (
                 one.name,
                 f"MAE {one.mae_nt:.4g} nT, {one.ratio:.3g} of naive, "
-                f"{100 * one.coverage:.3g} % in 90 % intervals, "
-                f"{one.rows:,} rows of {one.recordings:,} recordings",
+                f"{100 * one.coverage:.3g} % in 90 % intervals, {one.rows:,} rows",
             )
-            for one in self.parts
+            for one in (*self.parts, *self.paths)
         ]
-        return Summary(
-            f"TrainingResult: {self.predictor.kind}, {self.predictor.layers_text}, "
-            f"{self.rows:,} training rows",
-            (("split", f"by {self.split.by}"), *scores),
-            ("path", "MAE", "of naive", "rows"),
-            [(one.name, f"{one.mae_nt:.4g} nT", f"{one.ratio:.3g}", f"{one.rows:,}") for one in self.paths],
-        )
+        return Summary(f"TrainingResult: {self.predictor.kind}, {self.predictor.layers_text}", tuple(rows))

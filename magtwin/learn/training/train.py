@@ -93,17 +93,7 @@ def fit(
 ) -> TrainingResult:
     """Train on one part of a data set, stop and calibrate by another, judge by the third.
 
-    Args:
-        config: Model and options; its `seed`, `split` and `hold_out` are not read.
-        dataset: Labelled recordings.
-        split: Recordings of training, validation and test.
-        rng: Source of the initial weights, the order of rows and dropout.
-        progress: Called after each epoch.
-        advance: Called after each step with the rows done and the rows of all epochs.
-
-    Raises:
-        InputError: A part has no rows, the data set lacks a column of a feature, or the model cannot be
-            fitted.
+    Of `config`, `seed`, `split` and `hold_out` are not read; `rng` draws initial weights, order and dropout.
     """
     threads, before = config.threads or 1, torch.get_num_threads()
     with threadpool_limits(threads):  # the products of numpy and scipy
@@ -148,7 +138,7 @@ def _fit(
     )
     fitted = PREDICTORS[config.kind].fit(task)
     predictor, labels = fitted.model, task.train.y
-    mean, sd = float(labels.mean()), float(labels.std())
+    mean = float(labels.mean())
     parts = tuple(_errors(data, part, predictor, mean)[0] for part in PARTS[1:])
     driven = [recordings[name].path for name in data.rows["test"].names]
     _, *paths = _errors(data, "test", predictor, mean, driven)
@@ -161,25 +151,20 @@ def _fit(
     predictor.metadata.update(_outcome(fitted, parts))
     predictor.metadata.update(
         label_mean_nt=mean,
-        label_sd_nt=sd,
+        label_sd_nt=float(labels.std()),
         training_sessions=SEPARATOR.join(sessions),
         training_paths=SEPARATOR.join(ways),
     )
-    if (statistics := residuals(_held_out(data, fitted))) is not None:
-        predictor.metadata.update(statistics.metadata())
+    predictor.metadata.update(residuals(_held_out(data, fitted)))
     if config.kind != "mixed" and set(plants) != {NOMINAL}:  # the mean of a mixed model is that of NOMINAL
         predictor.metadata["training_plants"] = SEPARATOR.join(plants)
     return TrainingResult(
         predictor=predictor,
         config=config,
         history=fitted.history,
-        choice=fitted.choice,
         split=split,
         parts=parts,
         paths=tuple(paths),
-        label_mean_nt=mean,
-        label_sd_nt=sd,
-        rows=len(labels),
         judged_on=recordings_text(
             len(tested), [test.session for test in tested], [test.path for test in tested], sessions, ways
         ),
@@ -187,17 +172,11 @@ def _fit(
 
 
 def _outcome(fitted: Fit, parts: Sequence[PartErrors]) -> dict[str, MetadataValue]:
-    """Metadata about epochs, choice and errors."""
+    """Metadata about epochs and errors."""
     metadata: dict[str, MetadataValue] = {}
     if fitted.history:
         kept = next(epoch for epoch in reversed(fitted.history) if epoch.best)
         metadata |= {"epochs_run": fitted.history[-1].number, "epoch_kept": kept.number}
-    if fitted.choice:
-        metadata |= {
-            "network": "kept" if fitted.choice.kept else "left out",
-            "base_validation_mae_nt": fitted.choice.base_mae_nt,
-            "whole_validation_mae_nt": fitted.choice.whole_mae_nt,
-        }
     for part in parts:
         names = ("mae_nt", "naive_mae_nt", "ridge_mae_nt")
         metadata |= {f"{part.name}_{name}": getattr(part, name) for name in names}
