@@ -1,13 +1,9 @@
 """Evaluations: models against recordings as one report, with Table 1 and the figures of the paper."""
 
-import csv
-import os
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 
-from magtwin.errors import InputError
 from magtwin.figures.canvas import (
     INK,
     WIDTH_IN,
@@ -25,8 +21,7 @@ from magtwin.figures.canvas import (
 from magtwin.figures.maps import mean_field_ut
 from magtwin.figures.page import Page, Section, Table
 from magtwin.figures.reports import section_of_traversals
-from magtwin.figures.training import draw_correlations, label_epochs
-from magtwin.files.file import read_text
+from magtwin.figures.training import draw_correlations
 from magtwin.learn.data.correlation import correlations
 from magtwin.learn.data.features import FEATURES, FULL, features
 from magtwin.learn.evaluation.budget import TERMS, Budget
@@ -56,14 +51,10 @@ RANKED_HZ = 10.0
 SHOWN_S = 90.0
 """Length of the part of a run that is shown against time [s]."""
 
-EPOCH, CURVES = "number", {"train_rmse_nt": ("training", "--"), "val_rmse_nt": ("validation", "-")}
-"""Columns of a learning curve as `magtwin train` writes it."""
-
 
 def page_of_evaluation(
     evaluation: Evaluation,
     *,
-    curves: Mapping[str, Sequence[Mapping[str, float]]] | None = None,
     budgets: Sequence[Budget] = (),
     both: tuple[Traversals, tuple[str, str]] | None = None,
 ) -> Page:
@@ -71,7 +62,6 @@ def page_of_evaluation(
 
     Args:
         evaluation: Result of `magtwin.learn.evaluation.evaluate.evaluate`.
-        curves: Learning curves by model name, as `read_curve` gives them.
         budgets: Error budgets of its models.
         both: One path driven twice, and the names of the two runs.
     """
@@ -83,15 +73,17 @@ def page_of_evaluation(
         f"{against}."
     )
     verdicts = [f"{name}: {line}" for name, line in evaluation.verdicts().items()]
-    tables = (_models(evaluation), _maps(evaluation), _left_out(evaluation))
-    a_run = _known(_time_series(evaluation), _floor_plan(evaluation))
-    by_path = _known(_path_errors(evaluation), _learning_curves(evaluation, curves or {}))
+    lost = tuple(evaluation.left_out.items())
+    note = "All models are evaluated on the same readings." if lost else "None."
+    left_out = Table("Readings left out", ("reason", "readings"), lost, note)
+    tables = (_models(evaluation), _maps(evaluation), left_out)
+    a_run, correlated = (_time_series(evaluation), _floor_plan(evaluation)), _rank_correlations(evaluation)
     sections = (
         Section("Table 1", _lead_of_table(evaluation), (), (_table(evaluation),)),
         Section("Models and maps", "", (), tables),
-        Section("Inputs and the disturbance", "", _known(_rank_correlations(evaluation))),
+        Section("Inputs and the disturbance", "", () if correlated is None else (correlated,)),
         Section("A run", "", a_run),
-        Section("Errors by path", "", by_path),
+        Section("Errors by path", "", (_path_errors(evaluation),)),
         *([_budgets(budgets)] if budgets else []),
         *([section_of_traversals(*both)] if both else []),
         Section("Every score", "", (), (_intervals(evaluation),)),
@@ -101,34 +93,6 @@ def page_of_evaluation(
     data |= {"budget": {"models": [budget.summary() for budget in budgets]}} if budgets else {}
     data |= {"traversals": both[0].summary()} if both else {}
     return Page("Evaluation", " ".join([*verdicts, lead]), sections, data=data)
-
-
-def read_curve(weights: str | os.PathLike[str]) -> tuple[Mapping[str, float], ...]:
-    """The learning curve that `magtwin train` wrote beside weights, by epoch; empty if there is none.
-
-    Args:
-        weights: The weights file.
-
-    Raises:
-        InputError: The CSV file beside the weights is not a learning curve.
-    """
-    path = Path(weights).with_suffix(".csv")
-    if not path.is_file():
-        return ()
-    try:
-        rows = list(csv.DictReader(read_text(path, "learning curve", "text").splitlines()))
-        if not rows or EPOCH not in rows[0]:
-            return ()
-        names = [EPOCH, *(name for name in CURVES if name in rows[0])]
-        return tuple({name: float(row[name]) for name in names} for row in rows)
-    except (OSError, ValueError, TypeError, csv.Error) as error:
-        raise InputError(
-            f"{path}: not a learning curve as `magtwin train` writes it ({error}); move it away"
-        ) from error
-
-
-def _known(*pictures: Picture | None) -> tuple[Picture, ...]:
-    return tuple(picture for picture in pictures if picture is not None)
 
 
 def _lead_of_table(evaluation: Evaluation) -> str:
@@ -233,12 +197,6 @@ def _maps(evaluation: Evaluation) -> Table:
         "labels. map alone: the map without a model of the robot, before and after its mean error is removed."
     )
     return Table("Maps", (*head, "less its mean [nT]"), tuple(rows), note)
-
-
-def _left_out(evaluation: Evaluation) -> Table:
-    rows = tuple(evaluation.left_out.items())
-    note = "All models are evaluated on the same readings." if rows else "None."
-    return Table("Readings left out", ("reason", "readings"), rows, note)
 
 
 def _ink(m: int) -> str:
@@ -382,24 +340,3 @@ def _path_errors(evaluation: Evaluation) -> Picture:
     ax.set_axisbelow(True)
     legend_below(figure)
     return picture(figure, f"Figure 6 a, b: errors by path, with {LEVEL:.0%} intervals", file="figure_6ab")
-
-
-def _learning_curves(
-    evaluation: Evaluation, curves: Mapping[str, Sequence[Mapping[str, float]]]
-) -> Picture | None:
-    """Figure 6 c: learning curves of the models that have one."""
-    shown = {m: curves[name] for m, name in enumerate(evaluation.names) if curves.get(name)}
-    if not shown:
-        return None
-    figure = new_figure(WIDTH_IN, 3.4)
-    ax = figure.subplots()
-    for m, rows in shown.items():
-        for column, (part, style) in CURVES.items():
-            points = [(row[EPOCH], row[column]) for row in rows if column in row]
-            if points:
-                text = f"{evaluation.names[m]}, {part}"
-                ax.plot(*zip(*points, strict=True), ls=style, color=_ink(m), label=text)
-    label_epochs(ax)
-    legend_below(figure)
-    title = "Figure 6 c: error in training and on validation recordings over the epochs"
-    return picture(figure, title, file="figure_6c")

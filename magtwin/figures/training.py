@@ -6,7 +6,6 @@ from dataclasses import astuple, fields
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -36,19 +35,14 @@ def draw_learning_curve(
         ax.axhline(naive_rmse_nt, color="0.5", ls="--", lw=1, label="validation, naive mean")
     kept = next(epoch for epoch in reversed(history) if epoch.best)
     ax.plot(kept.number, kept.val_rmse_nt, "o", mfc="none", mec=INK, ms=9, label=f"kept: epoch {kept.number}")
-    label_epochs(ax)
-    ax.set_axisbelow(True)
-    ax.set_title(title, fontsize=10)
-    legend_below(figure)
-    return figure
-
-
-def label_epochs(ax: Axes) -> None:
-    """Axes, ticks and grid of errors [nT] over whole epochs."""
     ax.set_ylim(bottom=0)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     label(ax, "epoch", "RMSE [nT]")
     ax.grid(color="0.9")
+    ax.set_axisbelow(True)
+    ax.set_title(title, fontsize=10)
+    legend_below(figure)
+    return figure
 
 
 def write_learning_curve(

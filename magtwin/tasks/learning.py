@@ -36,8 +36,8 @@ from magtwin.learn.evaluation.candidates import (
     tolles_lawson_variants,
 )
 from magtwin.learn.evaluation.evaluate import evaluate as judge
+from magtwin.learn.evaluation.evaluate import trials_of, unlearned, unseen
 from magtwin.learn.evaluation.evaluation import Evaluation
-from magtwin.learn.evaluation.trials import trials_of, unlearned, unseen
 from magtwin.learn.inference.calibrate import calibrate as calibrate_model
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.inference.widen import widened

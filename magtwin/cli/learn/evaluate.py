@@ -75,11 +75,11 @@ def evaluate(
     """
     from json import loads
 
-    from magtwin.figures.evaluations import NAME, page_of_evaluation, read_curve
+    from magtwin.figures.evaluations import NAME, page_of_evaluation
     from magtwin.figures.page import to_json, write_pages
     from magtwin.files.outputs import check_free
     from magtwin.learn.evaluation.evaluation import TOTALS
-    from magtwin.tasks.learning import error_budget, map_of_scene, short_names
+    from magtwin.tasks.learning import error_budget, map_of_scene
     from magtwin.tasks.learning import evaluate as evaluate_models
 
     check_free(out, force=force)
@@ -111,8 +111,7 @@ def evaluate(
             budgets = error_budget(evaluation, scene, train, progress=advance)
     both = None if overlay is None else _overlaid(evaluation, overlay)
     step("Writing the report")
-    curves = {name: read_curve(path) for path, name in zip(weights, short_names(weights), strict=True)}
-    page = page_of_evaluation(evaluation, curves=curves, budgets=budgets, both=both)
+    page = page_of_evaluation(evaluation, budgets=budgets, both=both)
     write_pages(page, out, NAME, force=force)
     written = f"Wrote {out}: evaluation.html, evaluation.md, evaluation.json"
     return Done(table=lambda: _print(evaluation), text=written, data=loads(to_json(page)))

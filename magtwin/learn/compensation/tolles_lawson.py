@@ -86,8 +86,7 @@ def design_matrix(
         the bias, without unit for induced terms, and in s for eddy terms; with "magnav" all are in nT.
 
     Raises:
-        InputError: A term is unknown or given twice, the field is not (N, 3), is zero or not finite, or there
-            are fewer than three readings.
+        InputError: A term is unknown or given twice, or the field is not (N, 3), zero, or not finite.
     """
     magnav, b = _is_magnav(preset), np.asarray(b_vector_nt, float)
     if b.ndim != 2 or b.shape[1] != 3 or len(b) < 3:
@@ -153,16 +152,9 @@ class TollesLawson:
     """Conventions of the regressors and the fit, a name of `PRESETS`."""
 
     def interference_nt(self, b_vector_nt: ArrayLike, rate_hz: float) -> Array:
-        """Part of the magnitude from the platform, minus its mean unless the terms have a bias.
+        """Part of the magnitude from the platform [nT], shape (N,); arguments as for `design_matrix`.
 
-        The preset "magnav" does not subtract the mean.
-
-        Args:
-            b_vector_nt: Field of the vector magnetometer in the platform's axes [nT], shape (N, 3).
-            rate_hz: Readings a second [Hz].
-
-        Returns:
-            Interference [nT], shape (N,).
+        It is minus its mean, unless the terms have a bias or the preset is "magnav".
         """
         matrix, _ = design_matrix(b_vector_nt, rate_hz, self.terms, preset=self.preset)
         modelled = matrix @ np.asarray(self.coefficients)
@@ -256,9 +248,7 @@ def fit_tolles_lawson(
         preset: A name of `PRESETS`.
 
     Raises:
-        InputError: Shapes do not fit, the preset is unknown, a value is not finite, the band does not fit the
-            rate, a bias is asked for in a band without "magnav", or there are fewer readings than
-            coefficients.
+        InputError: Arguments do not fit each other, a value is not finite, or readings are too few.
     """
     b, magnav = np.asarray(b_nt, float), _is_magnav(preset)
     matrix, names = design_matrix(b_vector_nt, rate_hz, terms, preset=preset)
@@ -300,11 +290,7 @@ def fit_run(run: Run, **options: Any) -> TollesLawson:
     """`fit_tolles_lawson` on a run: b_measured_nt minus b_map_nt, against its field vectors.
 
     The longest unbroken stretch of rows with a map, a reading and a vector is used, because the filter needs
-    one.
-
-    Args:
-        run: A calibration run.
-        options: Options of `fit_tolles_lawson`.
+    one. `options` are those of `fit_tolles_lawson`.
 
     Raises:
         InputError: The run has no such vectors, or too few in a row.

@@ -13,7 +13,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.alignment import Alignment, alignment_of
 from magtwin.learn.data.dataset import Dataset, values_sha256
-from magtwin.learn.data.features import CARRIED, CIRCULAR, FEATURES, GRADIENT, features
+from magtwin.learn.data.features import CIRCULAR, FEATURES, features
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.origin import same_map
 from magtwin.learn.data.recording import thinned
@@ -175,16 +175,14 @@ def tolles_lawson(
     dataset: Dataset,
     names: Sequence[str] | None = None,
     *,
-    gradient: bool = False,
     alignment: Alignment | None = None,
 ) -> Candidate:
-    """A ridge regression of Tolles and Lawson's kind: heading, motion, currents, and the map's gradient.
+    """A ridge regression of Tolles and Lawson's kind: heading, motion and currents.
 
     Args:
         named: The map.
         dataset: Training recordings, which are labelled on it.
         names: Which of them. Default: all.
-        gradient: Add the terms of a lever arm and a latency to the inputs.
         alignment: Lever arm and latency. Default: those of the data set if it was labelled on this map, else
             0.
 
@@ -193,14 +191,12 @@ def tolles_lawson(
     """
     given = alignment is not None
     alignment = alignment or _alignment_on(dataset, named.checksums)
-    wanted = (*CIRCULAR, *GRADIENT, *CARRIED) if gradient else CIRCULAR
-    able = set(dataset.columns) | {"yaw", "b_map_gradient_nt_m"}
-    inputs = tuple(name for name in wanted if set(FEATURES[name].columns) <= able)
+    able = set(dataset.columns) | {"yaw"}
+    inputs = tuple(name for name in CIRCULAR if set(FEATURES[name].columns) <= able)
     x, y, sd, session = _training_rows(dataset, names, named.field, inputs, alignment)
     model = fit_linear(x, y, session, features=inputs, sd=sd).model
-    kind = "Tolles-Lawson and gradient" if gradient else "Tolles-Lawson"
     about = {"fitted to": dataset.folder.name, "penalty": model.penalty, "training rows": len(y)}
-    name = f"{kind}, {named.name}{' aligned' * given}"
+    name = f"Tolles-Lawson, {named.name}{' aligned' * given}"
     return Candidate(name, NeuralMagnetometer(model, name=name), named, alignment, about)
 
 
@@ -210,7 +206,7 @@ def tolles_lawson_variants(
     dataset: Dataset,
     names: Sequence[str] | None = None,
 ) -> list[Candidate]:
-    """Tolles and Lawson's ridge on each map: plain, with the candidates' alignment, and with gradient terms.
+    """Tolles and Lawson's ridge on each map: plain, and with the candidates' alignment.
 
     Args:
         maps: The maps.
@@ -228,8 +224,6 @@ def tolles_lawson_variants(
         variants.append(tolles_lawson(named, dataset, names))
         if fitted and variants[-1].alignment == Alignment():
             variants.append(tolles_lawson(named, dataset, names, alignment=fitted[0]))
-        aligned = variants[-1].alignment if variants[-1].alignment in fitted else None
-        variants.append(tolles_lawson(named, dataset, names, gradient=True, alignment=aligned))
     return variants
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError
 from magtwin.report.summary import Summarized
 from magtwin.report.verdict import Z_90
 
@@ -104,20 +103,10 @@ def scores(
     1989 for blocks). With one session or one run only the lower levels are resampled, and the interval does
     not cover other sessions.
 
-    Args:
-        runs: Errors by run, of the same models.
-        rng: Source of the draws.
-        draws: Number of resamples.
-
     Returns:
         Scores of each model by group, in order of first appearance; on all readings; and in the mean over
         groups.
-
-    Raises:
-        InputError: There is no run.
     """
-    if not runs:
-        raise InputError("no run to score")
     groups = list(dict.fromkeys(run.group for run in runs))
     children = iter(rng.spawn(len(groups) + 1))
     by_group: dict[str, tuple[Score, ...]] = {}

@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections import deque
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +55,7 @@ def thinned_rows(t: Array, rate_hz: float = RATE_HZ) -> NDArray[np.intp]:
     return np.array(kept, np.intp)
 
 
-@dataclass(frozen=True)
-class DriveEffects:
+class DriveEffects(NamedTuple):
     """What a labelled drive tells about its session."""
 
     effects: Effects

@@ -1,7 +1,7 @@
 """Hybrid: a linear base, and a small network for its residual if that does better."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -90,8 +90,8 @@ def hybrid_of(weights: Weights) -> Hybrid:
     extra = [name for name in weights.tensors if not name.startswith(("base.", "net."))]
     if extra:
         raise InputError(f"{weights.path}: tensor {extra[0]!r} belongs to no layer of a hybrid")
-    base = weights.with_tensors(parts["base"]).fit(like(len(weights.features)))
-    net = net_of(weights.with_tensors(parts["net"])) if parts["net"] else None
+    base = replace(weights, tensors=parts["base"]).fit(like(len(weights.features)))
+    net = net_of(replace(weights, tensors=parts["net"])) if parts["net"] else None
     return Hybrid(
         base=linear_from(weights, base),
         net=net,

@@ -20,13 +20,8 @@ from magtwin.learn.models.predictor import PREDICTORS
 
 Device = Literal["cpu", "cuda", "auto"]
 
-PRESETS: Mapping[str, tuple[str, Mapping[str, Any]]] = MappingProxyType(
-    {
-        "paper": ("mlp", {}),
-        "released": ("mlp", {"layers": (512, 512, 512, 128)}),
-    }
-)
-"""Models that are a kind of predictor with other defaults; all other models are named by their kind."""
+PAPER = "paper"
+"""Name of the kind "mlp" as a model; all other models are named by their kind."""
 
 MOST_WEIGHTS = 100_000_000  # Largest network; with gradients and Adam's moments it takes 1.6 GB
 BOUNDS: Mapping[str, tuple[float, float]] = MappingProxyType(
@@ -48,7 +43,7 @@ COMMON = ("model", "seed", "split", "hold_out", "init", "licence")  # Options th
 
 def models() -> list[str]:
     """Names of all models, those of installed packages included."""
-    return [*PRESETS, *(kind for kind in PREDICTORS if kind not in {of for of, _ in PRESETS.values()})]
+    return [PAPER, *(kind for kind in PREDICTORS if kind != "mlp")]
 
 
 def options_of(model: str) -> dict[str, Any]:
@@ -58,8 +53,7 @@ def options_of(model: str) -> dict[str, Any]:
         InputError: No such model.
     """
     find("model", model, dict.fromkeys(models()))
-    kind, changed = PRESETS.get(model, (model, {}))
-    return {**PREDICTORS[kind].options, **changed}
+    return dict(PREDICTORS["mlp" if model == PAPER else model].options)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,9 +65,9 @@ class TrainConfig:
     """
 
     model: str = "paper"
-    """The model: "paper" or "released" (multilayer perceptrons of the paper's or the released shape),
-    "linear" (Tolles-Lawson by ridge regression), "hybrid", "mixed" (coefficients that differ between
-    sessions), or a kind of `magtwin.learn.models.predictor.PREDICTORS`."""
+    """The model: "paper" (multilayer perceptron), "linear" (Tolles-Lawson by ridge regression), "hybrid",
+    "mixed" (coefficients that differ between sessions), or another kind of
+    `magtwin.learn.models.predictor.PREDICTORS`."""
 
     layers: tuple[int, ...] = ()
     """Widths of the hidden layers."""
@@ -156,7 +150,7 @@ class TrainConfig:
     @property
     def kind(self) -> str:
         """Kind of the predictor, a name of `PREDICTORS`."""
-        return PRESETS.get(self.model, (self.model, {}))[0]
+        return "mlp" if self.model == PAPER else self.model
 
     @property
     def inputs(self) -> tuple[str, ...]:

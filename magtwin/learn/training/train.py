@@ -16,16 +16,18 @@ from magtwin.errors import InputError
 from magtwin.files.file import sha256
 from magtwin.files.outputs import check_free, output, transaction
 from magtwin.learn.data.dataset import MANIFEST, Dataset, open_dataset
+from magtwin.learn.data.features import CIRCULAR, FEATURES
 from magtwin.learn.data.origin import NOMINAL, ROBOT_METADATA
+from magtwin.learn.data.recording import Rows
 from magtwin.learn.data.residuals import HeldOut, held_out_errors, residuals
 from magtwin.learn.data.split import PARTS, Part, Split
 from magtwin.learn.data.split import split as split_recordings
+from magtwin.learn.models.linear import fit_linear
 from magtwin.learn.models.predictor import PREDICTORS, Epoch, Fit, FitTask, Predictor, load_predictor
 from magtwin.learn.models.weights import MetadataValue
 from magtwin.learn.training.config import TrainConfig
 from magtwin.learn.training.model_card import model_card
 from magtwin.learn.training.result import PartErrors, TrainingResult
-from magtwin.learn.training.training_data import TrainingData, read_training_data
 from magtwin.report.verdict import SEPARATOR, coverage, recordings_text
 from magtwin.version import __version__
 
@@ -36,6 +38,9 @@ ORIGIN = (
     *ROBOT_METADATA,
 )
 """Metadata of a data set that weights keep."""
+
+RowsOf = Mapping[Part, Rows]
+Groups = Mapping[Part, NDArray[np.intp]]
 
 
 def train(
@@ -113,7 +118,7 @@ def _fit(
     advance: Callable[[int, int], None] | None,
 ) -> TrainingResult:
     """As `fit`, with threads set."""
-    data = read_training_data(dataset, split, config.inputs)
+    rows, groups = _read(dataset, split, config.inputs)
     init = None if config.init is None else load_predictor(config.init)
     if init is not None and init.kind != config.kind:
         raise InputError(
@@ -124,10 +129,10 @@ def _fit(
     recordings = {recording.name: recording for recording in dataset.recordings}
     task = FitTask(
         features=config.inputs,
-        train=data.rows["train"],
-        validation=data.rows["validation"],
-        train_groups=data.groups["train"],
-        validation_groups=data.groups["validation"],
+        train=rows["train"],
+        validation=rows["validation"],
+        train_groups=groups["train"],
+        validation_groups=groups["validation"],
         options=config.options,
         rng=rng,
         recordings=recordings,
@@ -139,9 +144,10 @@ def _fit(
     fitted = PREDICTORS[config.kind].fit(task)
     predictor, labels = fitted.model, task.train.y
     mean = float(labels.mean())
-    parts = tuple(_errors(data, part, predictor, mean)[0] for part in PARTS[1:])
-    driven = [recordings[name].path for name in data.rows["test"].names]
-    _, *paths = _errors(data, "test", predictor, mean, driven)
+    ridge = _ridge(dataset, rows, groups["train"])
+    parts = tuple(_errors(part, rows[part], ridge[part], predictor, mean)[0] for part in PARTS[1:])
+    driven = [recordings[name].path for name in rows["test"].names]
+    _, *paths = _errors("test", rows["test"], ridge["test"], predictor, mean, driven)
     learned, tested = ([recordings[name] for name in split.names(part)] for part in ("train", "test"))
     sessions = dict.fromkeys(recording.session for recording in learned)
     ways = dict.fromkeys(recording.path for recording in learned)
@@ -155,7 +161,7 @@ def _fit(
         training_sessions=SEPARATOR.join(sessions),
         training_paths=SEPARATOR.join(ways),
     )
-    predictor.metadata.update(residuals(_held_out(data, fitted)))
+    predictor.metadata.update(residuals(_held_out(rows, dataset, fitted)))
     if config.kind != "mixed" and set(plants) != {NOMINAL}:  # the mean of a mixed model is that of NOMINAL
         predictor.metadata["training_plants"] = SEPARATOR.join(plants)
     return TrainingResult(
@@ -196,27 +202,64 @@ def device_of(config: TrainConfig) -> str:
     return "cuda" if config.device != "cpu" and torch.cuda.is_available() else "cpu"
 
 
-def _held_out(data: TrainingData, fitted: Fit) -> list[HeldOut]:
+def _read(dataset: Dataset, split: Split, inputs: tuple[str, ...]) -> tuple[RowsOf, Groups]:
+    """Rows of each part, and the session, recording or path of each row, by what the split keeps whole."""
+    for part in PARTS:
+        if not split.names(part):
+            raise InputError(f"no recording is in {part}; record more, or hold out fewer")
+    terms = _ridge_terms(dataset)
+    rows = {part: dataset.rows(inputs, split=split, part=part, beside=terms) for part in PARTS}
+    unit = {
+        recording.name: {"session": recording.session, "path": recording.path}.get(split.by, recording.name)
+        for recording in dataset.recordings
+    }
+    if len({unit[name] for name in rows["train"].names}) == 1:  # cross-validation needs two groups
+        unit = {name: name for name in unit}
+    numbers = {name: i for i, name in enumerate(sorted(set(unit.values())))}
+    groups = {
+        part: np.array([numbers[unit[name]] for name in of.names], np.intp)[of.recording]
+        for part, of in rows.items()
+    }
+    return rows, groups
+
+
+def _ridge_terms(dataset: Dataset) -> tuple[str, ...]:
+    """Features of the comparison ridge that a data set has the columns for."""
+    return tuple(name for name in CIRCULAR if set(FEATURES[name].columns) <= set(dataset.columns))
+
+
+def _ridge(dataset: Dataset, rows: RowsOf, groups: NDArray[np.intp]) -> dict[Part, Array]:
+    """Disturbances [nT] by Tolles and Lawson's terms, as far as the data set has them, for each part.
+
+    They are fitted to the training rows. An input that is nan counts as its mean.
+    """
+    known = np.isfinite(rows["train"].beside)
+    mean = np.where(known, rows["train"].beside, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    x = {part: np.where(np.isfinite(of.beside), of.beside, mean) for part, of in rows.items()}
+    y, sd = rows["train"].y, rows["train"].sd
+    model = fit_linear(x["train"], y, groups, features=_ridge_terms(dataset), sd=sd).model
+    return {part: model.predict(of)[0] for part, of in x.items()}
+
+
+def _held_out(rows: RowsOf, dataset: Dataset, fitted: Fit) -> list[HeldOut]:
     """Errors on recordings that the model was not fitted to.
 
     These are validation and test, and training if the model was fitted without each of its groups in turn.
     """
     errors = []
-    for part in PARTS:
-        rows = data.rows[part]
-        predicted = fitted.held_out_nt if part == "train" else fitted.model.predict(rows.x)[0]
+    for part, of in rows.items():
+        predicted = fitted.held_out_nt if part == "train" else fitted.model.predict(of.x)[0]
         if predicted is not None:
-            errors += held_out_errors(rows, predicted - rows.y, data.dataset.recordings)
+            errors += held_out_errors(of, predicted - of.y, dataset.recordings)
     return errors
 
 
 def _errors(
-    data: TrainingData, part: Part, model: Predictor, mean: float, paths: Sequence[str] = ()
+    part: Part, rows: Rows, ridge: Array, model: Predictor, mean: float, paths: Sequence[str] = ()
 ) -> list[PartErrors]:
     """Errors on all rows of a part, then on those of each path; `paths` are those of its recordings."""
-    rows = data.rows[part]
     predicted, sd = model.predict(rows.x)
-    errors = (predicted - rows.y, mean - rows.y, data.ridge_of(part) - rows.y)
+    errors = (predicted - rows.y, mean - rows.y, ridge - rows.y)
     masks = {str(part): np.ones(len(rows.y), bool)}
     for path in dict.fromkeys(paths):
         on_path = np.array([name == path for name in paths])[rows.recording]
