@@ -1,8 +1,6 @@
 """Training: learning curves and input correlations, as in Figures 6c and 2 of the paper."""
 
-import os
 from collections.abc import Sequence
-from dataclasses import astuple, fields
 from typing import Any
 
 import numpy as np
@@ -10,7 +8,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from magtwin.figures.canvas import INK, MAP_INK, OTHER_INK, WIDTH_IN, label, legend_below, new_figure
-from magtwin.files.outputs import output
 from magtwin.learn.data.correlation import PAPER, Correlations
 from magtwin.learn.models.predictor import Epoch
 
@@ -43,20 +40,6 @@ def draw_learning_curve(
     ax.set_title(title, fontsize=10)
     legend_below(figure)
     return figure
-
-
-def write_learning_curve(
-    history: Sequence[Epoch], out: str | os.PathLike[str], *, force: bool = False
-) -> None:
-    """Write the epochs as CSV: number, training and validation RMSE, validation MAE [nT], and whether best.
-
-    Raises:
-        InputError: `out` exists.
-    """
-    lines = [",".join(field.name for field in fields(Epoch))]
-    lines += [",".join(repr(int(v) if isinstance(v, bool) else v) for v in astuple(e)) for e in history]
-    with output(out, force=force) as aside:
-        aside.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def draw_correlations(correlations: Correlations) -> Figure:

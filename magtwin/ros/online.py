@@ -25,7 +25,7 @@ from magtwin.ros.inputs import AHEAD_S, JUMP_S, MOST_KEPT, OTHER_S, LiveFrames, 
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.reader import Reading, Signals
-    from magtwin.learn.mixed.session_effects import FollowedEffects
+    from magtwin.learn.mixed.effects import FollowedEffects
     from magtwin.learn.models.predictor import Predictor
 
 QUIET_S = 30.0

@@ -43,7 +43,7 @@ from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.inference.widen import widened
 from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.predictor import Predictor, load_predictor
-from magtwin.learn.training.model_card import widened_card
+from magtwin.learn.training.result import widened_card
 from magtwin.run.run import Run
 from magtwin.spec.scene import Scene
 from magtwin.twin import check_scene, in_session_of, open_twin, scene_file

@@ -34,7 +34,7 @@ def train(
     """Train a model on a data set and measure its errors on recordings that it never saw.
 
     Beside F.safetensors it writes the model card F.md and, for a model trained in epochs, the learning curve
-    F.png and F.csv.
+    F.png.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def train(
     from dataclasses import fields
 
     from magtwin.figures.canvas import save
-    from magtwin.figures.training import draw_learning_curve, write_learning_curve
+    from magtwin.figures.training import draw_learning_curve
     from magtwin.files.outputs import check_free, transaction
     from magtwin.learn.training.config import TrainConfig, read_config
     from magtwin.learn.training.train import train as train_model
@@ -88,9 +88,9 @@ def train(
     base = TrainConfig() if config is None else read_config(config)
     names = [field.name for field in fields(base) if given.get(field.name) is not None]
     options = base.with_options(**{name: given[name] for name in names})
-    picture, table = (out.with_suffix(end) for end in (".png", ".csv"))
-    for path in () if options.epochs is None else (picture, table):
-        check_free(path, force=force)
+    picture = out.with_suffix(".png")
+    if options.epochs is not None:
+        check_free(picture, force=force)
     with transaction():
         with progress("Training", "rows") as show:
             pace = _Pace(show, options.epochs)
@@ -102,8 +102,7 @@ def train(
             save(
                 draw_learning_curve(result.history, naive_rmse_nt=naive, title=out.name), picture, force=force
             )
-            write_learning_curve(result.history, table, force=force)
-    shown = [path.name for path in (picture, table) if result.history]
+    shown = [picture.name] if result.history else []
     return Done(result.report(str(out)), (out, out.with_suffix(".md").name, *shown))
 
 

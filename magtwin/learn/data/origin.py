@@ -261,12 +261,6 @@ def _robot_mismatch(
             f"{name} learned {learned!r} with another [platform] than {robot.name!r} has here: what it "
             "predicts of the robot's own field is off by what was changed; train a network on this robot"
         )
-    if learned != robot.name:
-        same = "same" if learned_platform == platform_sha256 else "at the same place"
-        return Mismatch(
-            f"{name} learned the robot {learned!r}, and this is {robot.name!r}; its sensor is {same}, so no "
-            "effect is expected if only the name differs"
-        )
     return None
 
 

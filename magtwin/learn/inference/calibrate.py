@@ -17,8 +17,8 @@ from magtwin.learn.data.features import columns_of, features
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.origin import same_map
 from magtwin.learn.data.recording import Source, read, session_name
+from magtwin.learn.mixed.effects import RATE_HZ, thinned_rows
 from magtwin.learn.mixed.mixed import Mixed
-from magtwin.learn.mixed.session_effects import RATE_HZ, thinned_rows
 from magtwin.learn.models.predictor import Predictor
 from magtwin.learn.models.weights import MetadataValue
 from magtwin.run.run import Run

@@ -8,8 +8,8 @@ from magtwin.field.maps.map import AnomalyMap, Outside
 from magtwin.learn.inference.calibrate import check_pose_sd, labelled_drive, mixed_of_kind
 from magtwin.learn.inference.magnetometer import Read
 from magtwin.learn.inference.reader import Reader, Reading, Signals
+from magtwin.learn.mixed.effects import DELAY_S, MEMORY_S, FollowedEffects, followed
 from magtwin.learn.mixed.mixed import Mixed
-from magtwin.learn.mixed.session_effects import DELAY_S, MEMORY_S, FollowedEffects, followed
 from magtwin.learn.models.predictor import Predictor
 from magtwin.run.run import Run
 

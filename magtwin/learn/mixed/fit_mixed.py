@@ -12,16 +12,19 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.learn.data.inputs import Array, inputs_of
 from magtwin.learn.data.recording import Rows
-from magtwin.learn.mixed.effects import Effects, Sums, fit_effects, sums_of
-from magtwin.learn.mixed.mixed import FACTORS, Mixed, mixed_of
-from magtwin.learn.mixed.session_effects import (
+from magtwin.learn.mixed.effects import (
     DELAY_S,
+    Effects,
     FollowedEffects,
+    Sums,
     effects_of_drive,
+    fit_effects,
     followed,
     shares,
+    sums_of,
     thinned_rows,
 )
+from magtwin.learn.mixed.mixed import FACTORS, Mixed, mixed_of
 from magtwin.learn.models.calibration import Spread, quantile_factor
 from magtwin.learn.models.linear import fit_linear
 from magtwin.learn.models.predictor import Fit, FitTask

@@ -173,9 +173,6 @@ class Epoch:
     val_rmse_nt: float
     """RMSE on the validation rows, without dropout [nT]."""
 
-    val_mae_nt: float
-    """Mean absolute error on the validation rows [nT]."""
-
     best: bool
     """Whether no earlier epoch has a smaller val_rmse_nt; the last such epoch is kept."""
 

@@ -103,11 +103,10 @@ def train(
 
 def _continued(init: FieldNet, inputs: Inputs, hidden: tuple[int, ...], dropout: float) -> FieldNet:
     """The network to start from, its training ranges extended by the new rows, or unknown as before."""
-    if init.features != inputs.features or init.hidden != hidden:
+    if init.hidden != hidden:
         raise InputError(
-            f"the network to continue from has inputs {', '.join(init.features)} and layers of "
-            f"{init.hidden}, this training {', '.join(inputs.features)} and {hidden}; give it the same "
-            "features and layers"
+            f"the network to continue from has layers of {init.hidden}, this training {hidden}; give it the "
+            "same layers"
         )
     return replace(init, inputs=init.inputs.grown(inputs), dropout=dropout)
 
@@ -252,7 +251,7 @@ class Descent:
             )
         better = rmse < min((epoch.val_rmse_nt for epoch in self.history), default=math.inf)
         train_rmse = math.sqrt(squares / len(self.z))
-        self.history.append(Epoch(number, train_rmse, rmse, float(np.abs(error).mean()), better))
+        self.history.append(Epoch(number, train_rmse, rmse, better))
         if better:
             self.kept = copy.deepcopy(self.module.state_dict())
         if progress:

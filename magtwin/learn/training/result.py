@@ -1,15 +1,18 @@
-"""TrainingResult: a trained model, its errors on recordings that it never saw, and what reproduces it."""
+"""TrainingResult: a trained model, its errors on recordings that it never saw, and its card in Markdown."""
 
 import math
+import textwrap
 from dataclasses import dataclass
 
-from magtwin.learn.data.split import Split
-from magtwin.learn.models.predictor import Epoch, Predictor
+from magtwin.learn.data.split import PARTS, Split
+from magtwin.learn.models.predictor import PREDICTORS, Epoch, Predictor
 from magtwin.learn.models.weights import shown
 from magtwin.learn.training.config import TrainConfig
 from magtwin.report.report import Figure, Report
 from magtwin.report.summary import Summarized, Summary
 from magtwin.report.verdict import verdict
+
+MOST_NAMES = 40  # Most paths, and most test recordings, that a card lists
 
 
 @dataclass(frozen=True)
@@ -116,3 +119,166 @@ class TrainingResult(Summarized):
             for one in (*self.parts, *self.paths)
         ]
         return Summary(f"TrainingResult: {self.predictor.kind}, {self.predictor.layers_text}", tuple(rows))
+
+
+def model_card(result: TrainingResult, name: str, checksum: str) -> str:
+    """The card of a trained model.
+
+    Args:
+        result: The model with its errors.
+        name: Name of the weights file.
+        checksum: Its SHA-256.
+    """
+    predictor, metadata = result.predictor, result.predictor.metadata
+    what = (
+        "Predicts what a robot adds to a map of the magnetic field at its magnetometer [nT]. "
+        f"{PREDICTORS[predictor.kind].description}: {predictor.layers_text}, "
+        f"{predictor.parameters_count:,} parameters. SHA-256 `{checksum}`."
+    )
+    if result.config.licence:
+        what += f" Licence: {result.config.licence}."
+    if result.config.init is not None:
+        what += f" It continues from `{metadata['init']}` (SHA-256 `{metadata['init_sha256']}`)."
+    parts = [
+        f"# {name}",
+        _wrapped(what),
+        _wrapped(f"Inputs: {', '.join(predictor.features)}."),
+        _wrapped(f"**Warning: {result.split.leak}.**") if result.split.leak else "",
+        "## Data",
+        _data(result),
+        "## Errors",
+        _wrapped(f"**{result.verdict()}**"),
+        _wrapped(_how(result)),
+        _table(result),
+        _wrapped(_spread(predictor.kind)),
+        "## To reproduce it",
+        _reproduce(result, name),
+    ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def widened_card(card: str, before: str, after: str, predictor: Predictor) -> str:
+    """The card of a model that `magtwin network widen` made of another.
+
+    Args:
+        card: The card of the other.
+        before: SHA-256 of its weights file.
+        after: SHA-256 of the new one.
+        predictor: The new model.
+    """
+    robots, readings = (predictor.metadata[f"wide_{name}"] for name in ("robots", "readings"))
+    sd = 0.0 if predictor.wide is None else predictor.wide.mean_nt
+    text = (
+        f"On robots other than that of its training the standard deviation is {sd:.0f} nT (root mean square "
+        f"of training rows). `magtwin network widen` learned it from {readings:,} readings of {robots} "
+        "robots."
+    )
+    return f"{card.replace(before, after)}\n## On other robots\n\n{_wrapped(text)}\n"
+
+
+def _data(result: TrainingResult) -> str:
+    metadata, split = result.predictor.metadata, result.split
+    counts = ", ".join(f"{len(split.names(part))} in {part}" for part in PARTS)
+    names = ", ".join(split.test[:MOST_NAMES])
+    names += f" and {len(split.test) - MOST_NAMES} more" if len(split.test) > MOST_NAMES else ""
+    dataset, field = (_plain(str(metadata[key])) for key in ("dataset", "map"))
+    label = f"{metadata['label_mean_nt']:.1f} +- {metadata['label_sd_nt']:.1f} nT"
+    points = (
+        f"Data set `{dataset}`, SHA-256 of its manifest `{metadata['dataset_sha256']}`.",
+        f"Labelled on the map `{field}`, SHA-256 `{metadata['map_sha256']}`: measured field minus map, "
+        f"at a lever arm of {metadata['lever_arm_m']} m and a latency of {metadata['latency_s']:g} s "
+        f"(standard deviations {metadata['lever_arm_sd_m']} m and {metadata['latency_sd_s']:g} s).",
+        f"{metadata['training_rows']:,} training rows, labels {label}.",
+        f"Recordings split by {split.by}: {counts}.",
+        f"Test: {names}.",
+    )
+    return "\n".join(_wrapped(point, bullet=True) for point in points)
+
+
+def _how(result: TrainingResult) -> str:
+    """The columns of the table, and what validation was used for."""
+    told, chosen = result.predictor.metadata, "Validation calibrated the intervals; "
+    if result.history:
+        chosen = f"Validation chose the epoch, {told['epoch_kept']} of {told['epochs_run']}; "
+    if "network" in told:
+        decision = "is kept" if told["network"] == "kept" else "is left out, the base alone remains"
+        chosen += (
+            f"on the validation recordings the base alone errs by {told['base_validation_mae_nt']:.1f} nT, "
+            f"with the network by {told['whole_validation_mae_nt']:.1f} nT: the network {decision}; "
+        )
+    return (
+        "Of the total field at the sensor [nT]. Naive: the mean training label on every row. Ridge: Tolles "
+        "and Lawson's terms (heading harmonics, speed, turning, current, LiDAR) by ridge regression on the "
+        "same training rows. Within 90 %: the share of rows inside the predicted interval of 90 %. "
+        f"{chosen}the test was used once."
+    )
+
+
+def _table(result: TrainingResult) -> str:
+    """Errors by part, and on the test by path."""
+    heads = ["rows of", "recordings", "rows", "MAE", "RMSE", "naive MAE", "naive RMSE", "MAE / naive"]
+    heads += ["ridge MAE", "ridge RMSE", "within 90 %"]
+    lines = [_line(heads), _line(["---"] * len(heads))]
+    shown = result.paths[:MOST_NAMES] if len(result.paths) > 1 else ()
+    for errors in (*result.parts, *shown):
+        values = (errors.mae_nt, errors.rmse_nt, errors.naive_mae_nt, errors.naive_rmse_nt)
+        cells = [
+            errors.name,
+            f"{errors.recordings:,}",
+            f"{errors.rows:,}",
+            *(f"{value:.1f}" for value in values),
+        ]
+        cells += [f"{errors.ratio:.3f}", f"{errors.ridge_mae_nt:.1f}", f"{errors.ridge_rmse_nt:.1f}"]
+        cells += ["-" if math.isnan(errors.coverage) else f"{errors.coverage:.3f}"]
+        lines.append(_line(cells))
+    if len(result.paths) > MOST_NAMES:
+        lines.append(f"\nThe first {MOST_NAMES} of {len(result.paths)} paths are shown.")
+    return "\n".join(lines)
+
+
+def _spread(kind: str) -> str:
+    """Where the width of the intervals comes from."""
+    alike = "Rows of a recording are correlated: judge these errors by the number of recordings, not of rows."
+    if kind == "mlp":
+        return (
+            "The intervals come from the RMSE on validation. The file keeps the RMSE on the test as "
+            "`residual_sd_nt`, which is the standard deviation of a prediction, `b_sd_nt` in a Run. "
+            f"{alike}"
+        )
+    return (
+        "Each row has its own standard deviation, `b_sd_nt` in a Run. It is scaled so that 90 % intervals "
+        "hold 90 % on recordings left out of the fit, none of them in the test. The file keeps the RMSE on "
+        f"the test as `residual_sd_nt`. {alike}"
+    )
+
+
+def _reproduce(result: TrainingResult, name: str) -> str:
+    metadata = result.predictor.metadata
+    by = f"magtwin {metadata['magtwin']}"
+    if "torch" in metadata:
+        by += f", torch {metadata['torch']}, on {metadata['device']} with threads = {metadata['threads']}"
+    command = f"magtwin train {_plain(str(metadata['dataset']))} --config F.toml --out {name}"
+    text = _wrapped(f"{by}, and as `F.toml` in `{command}`:")
+    return f"{text}\n\n```toml\n{str(metadata['config']).rstrip()}\n```"
+
+
+def _wrapped(text: str, *, bullet: bool = False) -> str:
+    """Text in lines of 110 characters."""
+    first, later = ("* ", "  ") if bullet else ("", "")
+    return textwrap.fill(
+        text,
+        110,
+        initial_indent=first,
+        subsequent_indent=later,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def _plain(text: str) -> str:
+    """A name without characters that Markdown would interpret."""
+    return "".join(" " if c in "|`<>" or not c.isprintable() else c for c in text)
+
+
+def _line(cells: list[str]) -> str:
+    return f"| {' | '.join(map(_plain, cells))} |"

@@ -26,8 +26,7 @@ from magtwin.learn.models.linear import fit_linear
 from magtwin.learn.models.predictor import PREDICTORS, Epoch, Fit, FitTask, Predictor, load_predictor
 from magtwin.learn.models.weights import MetadataValue
 from magtwin.learn.training.config import TrainConfig
-from magtwin.learn.training.model_card import model_card
-from magtwin.learn.training.result import PartErrors, TrainingResult
+from magtwin.learn.training.result import PartErrors, TrainingResult, model_card
 from magtwin.report.verdict import SEPARATOR, coverage, recordings_text
 from magtwin.version import __version__
 

@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from magtwin.learn.mixed.effects import Effects, fit_effects, posterior, sums_of
-from magtwin.learn.mixed.session_effects import (
+from magtwin.learn.mixed.effects import (
     CORRELATION_S,
     MEMORY_S,
+    Effects,
     FollowedEffects,
     effects_of_drive,
+    fit_effects,
+    posterior,
     shares,
+    sums_of,
     thinned_rows,
 )
 
