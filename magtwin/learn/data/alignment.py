@@ -1,6 +1,6 @@
 """Alignment: the place and time of a reading relative to the pose with its stamp, and its fit to a map."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -133,8 +133,6 @@ def slopes(gradient: Array, yaw: Array, rates: Array) -> Array:
 def fit_alignment(
     runs: Sequence[Run],
     field: AnomalyMap,
-    *,
-    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
 ) -> Alignment:
     """Lever arm and latency with which readings agree best with a map.
 
@@ -163,7 +161,6 @@ def fit_alignment(
     Args:
         runs: Runs of one robot that turns and drives at several speeds, as for `magtwin.learn.data.labels`.
         field: The map.
-        progress: Called as progress(done, total, what), once per linearisation.
 
     Raises:
         InputError: Fewer than `LEAST_ROWS` readings have a label.
@@ -177,23 +174,13 @@ def fit_alignment(
             f"{known} readings have a label on the map {field.name!r}, too few to fit lever arm and latency: "
             f"it takes {LEAST_ROWS}; do the runs lie on the map?"
         )
-    fit, total = _Fit(runs, field), len(LATENCIES_S) + STARTS * ROUNDS
+    fit = _Fit(runs, field)
     tried = np.zeros((len(LATENCIES_S), 3))
     tried[:, 2] = LATENCIES_S
-    residuals = []
-    for k, place in enumerate(tried):
-        progress(k, total, "latencies")
-        residuals.append(fit.at(place).promised)
-    starts = [tried[i] for i in np.argsort(residuals)[:STARTS]]
+    starts = [tried[i] for i in np.argsort([fit.at(place).promised for place in tried])[:STARTS]]
     fit.alike = fit.at(starts[0]).alike
-
-    def descended(k: int, start: Array) -> _Linearised:
-        done = len(LATENCIES_S) + k * ROUNDS
-        return _descend(fit, start, lambda j: progress(done + j, total, "rounds"))
-
-    best = min((descended(k, start) for k, start in enumerate(starts)), key=lambda result: result.cost)
+    best = min((_descend(fit, start) for start in starts), key=lambda result: result.cost)
     sd = np.sqrt(np.diag(fit.at(best.place, robust=True).covariance))
-    progress(total, total, "rounds")
     forward, left, late = best.place.tolist()
     return Alignment((forward, left), late, (float(sd[0]), float(sd[1])), float(sd[2]))
 
@@ -215,11 +202,10 @@ class _Linearised:
     """Number of readings that err as one."""
 
 
-def _descend(fit: "_Fit", start: Array, report: Callable[[int], Any]) -> _Linearised:
+def _descend(fit: "_Fit", start: Array) -> _Linearised:
     """Iterate from a start; a step that raises the cost is halved."""
     here = fit.at(start)
-    for k in range(ROUNDS):
-        report(k)
+    for _ in range(ROUNDS):
         step = here.wanted - here.place
         sd = np.sqrt(np.diag(here.covariance))
         if np.all(np.abs(step) < 1e-3 * sd):

@@ -324,13 +324,8 @@ def build_dataset(
     if alignment == "fit":
         how = "fitted"
         runs = run_all(_to_align, sources, jobs=jobs, progress=each(0, ": aligning"))
-        alignment = fit_alignment(
-            runs,
-            field,
-            progress=lambda k, n, what: report(
-                len(sources), total, f"lever arm and latency: {k} of {n} {what}"
-            ),
-        )
+        report(len(sources), total, "lever arm and latency")
+        alignment = fit_alignment(runs, field)
         del runs
     elif alignment is not None and not isinstance(alignment, Alignment):
         raise InputError(f'alignment must be "fit", an Alignment or None, got {alignment!r}')

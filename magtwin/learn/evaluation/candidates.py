@@ -4,7 +4,7 @@ import math
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,17 +28,6 @@ NAIVE = "naive"  # Name of the naive model
 
 TRAINED_AT_HZ = 10.0
 """Highest rate of training rows of a baseline [Hz]; nearer rows are too alike to add information."""
-
-
-class Model(Protocol):
-    """Predicts a disturbance; a `NeuralMagnetometer` is one."""
-
-    @property
-    def features(self) -> tuple[str, ...]:
-        """Names of its inputs."""
-
-    def read(self, runs: Sequence[Run]) -> list[Read]:
-        """Disturbances, their standard deviations, and rows outside the training ranges, of each run."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +78,7 @@ class Candidate(Summarized):
     """A model with the map, lever arm and latency that it learned with."""
 
     name: str
-    model: Model
+    model: NeuralMagnetometer | Mean
     map: NamedMap
     alignment: Alignment = field(default_factory=Alignment)
     metadata: Mapping[str, Any] = field(default_factory=dict)
@@ -206,21 +195,11 @@ def tolles_lawson_variants(
     dataset: Dataset,
     names: Sequence[str] | None = None,
 ) -> list[Candidate]:
-    """Tolles and Lawson's ridge on each map: plain, and with the candidates' alignment.
-
-    Args:
-        maps: The maps.
-        candidates: Models whose lever arm and latency are used.
-        dataset: Training recordings.
-        names: Which of them. Default: all.
-    """
+    """Tolles and Lawson's ridge on each map: plain, and with the alignment of the first candidate on it."""
     variants = []
     for named in maps:
-        fitted = [
-            candidate.alignment
-            for candidate in candidates
-            if candidate.map is named and candidate.alignment != Alignment()
-        ]
+        fitted = [each.alignment for each in candidates if each.map is named]
+        fitted = [alignment for alignment in fitted if alignment != Alignment()]
         variants.append(tolles_lawson(named, dataset, names))
         if fitted and variants[-1].alignment == Alignment():
             variants.append(tolles_lawson(named, dataset, names, alignment=fitted[0]))

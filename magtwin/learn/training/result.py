@@ -214,23 +214,28 @@ def _how(result: TrainingResult) -> str:
     )
 
 
+COLUMNS = {
+    "MAE": "mae_nt",
+    "RMSE": "rmse_nt",
+    "naive MAE": "naive_mae_nt",
+    "naive RMSE": "naive_rmse_nt",
+    "MAE / naive": "ratio",
+    "ridge MAE": "ridge_mae_nt",
+    "ridge RMSE": "ridge_rmse_nt",
+    "within 90 %": "coverage",
+}
+"""Columns of a card's table, and what of `PartErrors` they show."""
+
+
 def _table(result: TrainingResult) -> str:
     """Errors by part, and on the test by path."""
-    heads = ["rows of", "recordings", "rows", "MAE", "RMSE", "naive MAE", "naive RMSE", "MAE / naive"]
-    heads += ["ridge MAE", "ridge RMSE", "within 90 %"]
+    heads = ["rows of", "recordings", "rows", *COLUMNS]
     lines = [_line(heads), _line(["---"] * len(heads))]
     shown = result.paths[:MOST_NAMES] if len(result.paths) > 1 else ()
     for errors in (*result.parts, *shown):
-        values = (errors.mae_nt, errors.rmse_nt, errors.naive_mae_nt, errors.naive_rmse_nt)
-        cells = [
-            errors.name,
-            f"{errors.recordings:,}",
-            f"{errors.rows:,}",
-            *(f"{value:.1f}" for value in values),
-        ]
-        cells += [f"{errors.ratio:.3f}", f"{errors.ridge_mae_nt:.1f}", f"{errors.ridge_rmse_nt:.1f}"]
-        cells += ["-" if math.isnan(errors.coverage) else f"{errors.coverage:.3f}"]
-        lines.append(_line(cells))
+        values = {name: getattr(errors, name) for name in COLUMNS.values()}
+        cells = [f"{value:.{1 if name.endswith('nt') else 3}f}" for name, value in values.items()]
+        lines.append(_line([errors.name, f"{errors.recordings:,}", f"{errors.rows:,}", *cells]))
     if len(result.paths) > MOST_NAMES:
         lines.append(f"\nThe first {MOST_NAMES} of {len(result.paths)} paths are shown.")
     return "\n".join(lines)
@@ -238,17 +243,16 @@ def _table(result: TrainingResult) -> str:
 
 def _spread(kind: str) -> str:
     """Where the width of the intervals comes from."""
-    alike = "Rows of a recording are correlated: judge these errors by the number of recordings, not of rows."
-    if kind == "mlp":
-        return (
-            "The intervals come from the RMSE on validation. The file keeps the RMSE on the test as "
-            "`residual_sd_nt`, which is the standard deviation of a prediction, `b_sd_nt` in a Run. "
-            f"{alike}"
-        )
+    own = (
+        "Each row has its own standard deviation, scaled so that 90 % intervals hold 90 % on recordings left "
+        "out of the fit, none of them in the test."
+    )
+    alike = (
+        "The intervals in this table come from the RMSE on validation, `b_sd_nt` of a Run from the test's."
+    )
     return (
-        "Each row has its own standard deviation, `b_sd_nt` in a Run. It is scaled so that 90 % intervals "
-        "hold 90 % on recordings left out of the fit, none of them in the test. The file keeps the RMSE on "
-        f"the test as `residual_sd_nt`. {alike}"
+        f"{alike if kind == 'mlp' else own} The file keeps the RMSE on the test as `residual_sd_nt`. Rows of "
+        "a recording are correlated: judge these errors by the number of recordings, not of rows."
     )
 
 
