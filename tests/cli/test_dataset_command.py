@@ -143,17 +143,6 @@ def test_info_tells_of_every_recording_and_reads_every_shard(made, capsys):
     assert told["figures"]["labels"]["value"] == 320
 
 
-def test_correlate_tells_and_draws(made, tmp_path, capsys):
-    main(["dataset", "correlate", str(made), "--out", str(tmp_path / "f.png"), "--json"])
-    told = json.loads(capsys.readouterr().out)
-    assert len(told["figures"]) == 20
-    assert told["figures"]["odom_v_x"]["value"] == "never varies"
-    assert told["metadata"]["groups"] == 4
-    assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
-    main(["dataset", "correlate", str(made), "--features", "lidar_on, imu_w_x", "--json"])
-    assert list(json.loads(capsys.readouterr().out)["figures"]) == ["lidar_on", "imu_w_x"]
-
-
 @pytest.mark.parametrize(
     ("options", "text"),
     [
@@ -167,11 +156,6 @@ def test_correlate_tells_and_draws(made, tmp_path, capsys):
             ["build", "DAYS/c.parquet", "--alignment", "fit"],
             "80 readings have a label on the map 'lab', too few",
         ),
-        (
-            ["correlate", "SET", "--features", "gradiant"],
-            "no feature set 'gradiant'; did you mean 'gradient'?",
-        ),
-        (["correlate", "SET", "--features", "vector"], "which not all of its recordings have"),
         (["info", "DAYS"], "no such manifest of a data set"),
     ],
 )

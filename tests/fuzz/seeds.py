@@ -518,19 +518,6 @@ def _onnx(file: Path) -> None:
     file.with_name("net.safetensors").unlink()
 
 
-_SETTINGS = {"model": "mlp", "epochs": 3, "layers": [4]}
-
-
-def _tensors() -> Any:
-    import torch
-
-    return {"module.a": torch.zeros(2, 3), "best.a": torch.ones(2, 3)}
-
-
-def _state(file: Path) -> None:
-    call("learn.training.state:save_state", file, _tensors(), _SETTINGS, [{"epoch": 1, "loss": 0.5}])
-
-
 def _tolles_lawson(file: Path) -> None:
     from magtwin.learn.compensation.tolles_lawson import TollesLawson
 
@@ -810,11 +797,6 @@ FORMATS: Mapping[str, Format] = {
     "hybrid": Format("hybrid.safetensors", _network, _NETWORK),
     "pth": Format("x.pth", _checkpoint, _NETWORK),
     "onnx": Format("x.onnx", _onnx, _reads("learn.inference.onnx:report_onnx")),
-    "state": Format(
-        "x.safetensors",
-        _state,
-        lambda file: call("learn.training.state:load_state", file, _tensors(), _SETTINGS),
-    ),
     "tolles-lawson": Format("x.json", _tolles_lawson, _read_tolles_lawson),
     "dataset": Format("dataset.json", _dataset, _read_dataset),
     "shard": Format("runs/a.parquet", _dataset, _read_shard),

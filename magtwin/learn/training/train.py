@@ -269,7 +269,9 @@ def _errors(
             name,
             len(np.unique(rows.recording[mask])),
             int(mask.sum()),
-            *(size(error[mask]) for error in errors for size in (_mae, _rmse)),
+            *_sizes(errors[0][mask]),
+            *_sizes(errors[1][mask]),
+            *_sizes(errors[2][mask]),
             coverage(errors[0][mask], sd[mask]),
         )
         for name, mask in masks.items()
@@ -307,9 +309,6 @@ def _provenance(
     return metadata
 
 
-def _mae(error: Array) -> float:
-    return float(np.mean(np.abs(error)))
-
-
-def _rmse(error: Array) -> float:
-    return float(np.sqrt(np.mean(error**2)))
+def _sizes(error: Array) -> tuple[float, float]:
+    """Mean absolute and root mean square error."""
+    return float(np.mean(np.abs(error))), float(np.sqrt(np.mean(error**2)))

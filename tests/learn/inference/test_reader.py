@@ -3,8 +3,8 @@ import sys
 
 import numpy as np
 import pytest
+from learn_drives import random_run as a_run
 from numpy.testing import assert_allclose
-from test_features import a_run
 from test_magnetometer import forward64, inputs
 from test_network import RELEASED, a_net
 from test_predictor import KINDS, a_predictor

@@ -12,7 +12,7 @@ from magtwin.errors import InputError
 from magtwin.learn.data.features import FULL, feature_names
 from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.models.checkpoint import read_checkpoint
-from magtwin.learn.models.network import FieldNet, check_shape, convert
+from magtwin.learn.models.network import FieldNet, convert
 from magtwin.learn.models.perceptron import Layer
 from magtwin.learn.models.predictor import load_predictor
 from magtwin.learn.training.config import TrainConfig
@@ -105,16 +105,11 @@ def test_the_released_network_converts_once_and_stays_itself(real_data, tmp_path
         assert_array_equal(layer.weight, checkpoint[f"layers.{i}.weight"])
         assert_array_equal(layer.bias, checkpoint[f"layers.{i}.bias"])
     assert net.metadata == converted.metadata
+    for name, value in load_predictor(real_data / RELEASED).tensors().items():  # without conversion
+        assert_array_equal(net.tensors()[name], value)
     assert net.metadata["source_sha256"] == "2418abc80cb0eab578e1e8af35f53566db2efa84b1cfa5257710d15273a07cf0"
     assert math.isnan(net.residual_sd_nt)
     assert np.isnan(net.inputs.low).all()
-
-
-def test_a_pth_loads_without_conversion(real_data, tmp_path):
-    convert(real_data / RELEASED, tmp_path / "n.safetensors")
-    a, b = load_predictor(real_data / RELEASED), load_predictor(tmp_path / "n.safetensors")
-    for name, value in a.tensors().items():
-        assert_array_equal(b.tensors()[name], value)
 
 
 def test_an_output_that_exists_is_refused_unless_forced(real_data, tmp_path):
@@ -147,90 +142,46 @@ def ones(*shape):
     return np.ones(shape, np.float32)
 
 
+DEEP = {"metadata": {"magtwin": "[" * 100_000}}
+
+
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (
-            {"drop": ["x_mean"]},
-            "tensor 'x_mean' is missing; train or convert the network again",
-        ),
-        (
-            {"drop": ["layers.1.bias"]},
-            "tensor 'layers.1.bias' is missing; train or convert the network again",
-        ),
-        (
-            {"drop": ["layers.1.weight", "layers.2.weight"]},
-            "tensor 'layers.1.weight' is missing; train or convert the network again",
-        ),
-        (
-            {"layers__0__weight": ones(8, 3)},
-            "tensor 'layers.0.weight' is float32 (8, 3), the 2 features and the other layers ask for "
-            "float32 (8, 2)",
-        ),
-        (
-            {"layers__1__weight": ones(4, 9)},
-            "tensor 'layers.1.weight' is float32 (4, 9), the 2 features and the other layers ask for "
-            "float32 (4, 8)",
-        ),
-        (
-            {"x_mean": 0 * ones(2)},
-            "tensor 'x_mean' is float32 (2,), the 2 features and the other layers ask for float64 (2,)",
-        ),
-        (
-            {"layers__2__bias": math.nan * ones(1)},
-            "tensor 'layers.2.bias' has numbers that are nan or infinite",
-        ),
-        (
-            {"x_scale": np.array([1.0, 0.0])},
-            "a scale of its scalers is not above 0",
-        ),
-        ({"spare": ones(1)}, "tensor 'spare' belongs to no layer of a FieldNet"),
-        (
-            {"about": {"features": ["yaw_deg", "odom_vx"]}},
-            "no feature 'odom_vx'; did you mean 'odom_v_x'?",
-        ),
-        (
-            {"about": {"units": ["rad", "m/s"]}},
-            "reads yaw_deg in 'rad', magtwin gives it in 'deg'",
-        ),
-        ({"about": {"dropout": "much"}}, "'dropout' of its metadata is missing or of the wrong type"),
-        ({"about": {"features": [1, 2]}}, "'features' of its metadata must be names, one at least"),
-        ({"about": {"features": []}}, "'features' of its metadata must be names, one at least"),
-        ({"about": {"features": 5}}, "'features' of its metadata is missing or of the wrong type"),
-        ({"metadata": {"magtwin": '{"a": 5}'}}, "format version None, this magtwin reads 1; update magtwin"),
-        ({"metadata": {"magtwin": "5"}}, "format version None, this magtwin reads 1; update magtwin"),
-        (
-            {"about": {"residual_sd_nt": math.inf}},
-            "'residual_sd_nt' of its metadata must be 0 nT or more and finite, got inf",
-        ),
-        ({"about": {"facts": {"a": [1]}}}, "'a' of its metadata must be text, a number, true or false"),
-        (
-            {"layers__0__weight": ones()},
-            "tensor 'layers.0.weight' is float32 (); a layer's have shape (out, in)",
-        ),
-        (
-            {"layers__2__weight": ones(4)},
-            "tensor 'layers.2.weight' is float32 (4,); a layer's have shape (out, in)",
-        ),
-        ({"about": {"format_version": 2}}, "format version 2, this magtwin reads 1; update magtwin"),
-        ({"metadata": {"magtwin": "{"}}, "its metadata is not JSON (Expecting property name enclosed in "
-                                         "double quotes: line 1 column 2 (char 1))"),
-        (
-            {"metadata": {"magtwin": "[" * 100_000}},
-            "its metadata is not JSON (maximum recursion depth exceeded while decoding a JSON array from a "
-            "unicode string)",
-        ),
-        (
-            {"metadata": {"format": "pt"}},
-            "safetensors without magtwin's metadata; not a network of magtwin's",
-        ),
+        ({"drop": ["x_mean"]}, "tensor 'x_mean' is missing"),
+        ({"drop": ["layers.1.bias"]}, "tensor 'layers.1.bias' is missing"),
+        ({"drop": ["layers.1.weight", "layers.2.weight"]}, "tensor 'layers.1.weight' is missing"),
+        ({"layers__0__weight": ones(8, 3)}, "'layers.0.weight' is float32 (8, 3)"),
+        ({"layers__1__weight": ones(4, 9)}, "'layers.1.weight' is float32 (4, 9)"),
+        ({"layers__0__weight": ones()}, "'layers.0.weight' is float32 (); a layer's"),
+        ({"layers__2__weight": ones(4)}, "'layers.2.weight' is float32 (4,); a layer's"),
+        ({"x_mean": 0 * ones(2)}, "'x_mean' is float32 (2,)"),
+        ({"layers__2__bias": math.nan * ones(1)}, "nan or infinite"),
+        ({"x_scale": np.array([1.0, 0.0])}, "a scale of its scalers"),
+        ({"spare": ones(1)}, "'spare' belongs to no layer"),
+        ({"about": {"features": ["yaw_deg", "odom_vx"]}}, "did you mean 'odom_v_x'"),
+        ({"about": {"units": ["rad", "m/s"]}}, "reads yaw_deg in 'rad'"),
+        ({"about": {"dropout": "much"}}, "'dropout' of its metadata"),
+        ({"about": {"dropout": 1.0}}, "dropout in 0..1"),
+        ({"about": {"features": [1, 2]}}, "'features' of its metadata must be names"),
+        ({"about": {"features": []}}, "'features' of its metadata must be names"),
+        ({"about": {"features": 5}}, "'features' of its metadata is missing"),
+        ({"about": {"residual_sd_nt": math.inf}}, "'residual_sd_nt' of its metadata must be 0 nT or more"),
+        ({"about": {"facts": {"a": [1]}}}, "'a' of its metadata"),
+        ({"about": {"facts": {"a": 10**400}}}, "'a' of its metadata"),
+        ({"about": {"format_version": 2}}, "format version 2"),
+        ({"metadata": {"magtwin": "5"}}, "format version None"),
+        ({"metadata": {"magtwin": "{"}}, "its metadata is not JSON"),
+        (DEEP, "its metadata is not JSON"),
+        ({"metadata": {"format": "pt"}}, "without magtwin's metadata"),
     ],
-)  # fmt: skip
+)
 def test_a_weights_file_that_does_not_hold_together_is_refused(tmp_path, change, text):
     path = changed(tmp_path, **change)
     with pytest.raises(InputError) as refused:
         load_predictor(path)
-    assert str(refused.value) == f"{path}: {text}"
+    assert str(refused.value).startswith(f"{path}: ")
+    assert text in str(refused.value)
 
 
 def test_a_truncated_weights_file_is_refused(tmp_path):
@@ -252,9 +203,3 @@ def test_a_file_of_another_kind_is_refused(tmp_path, content):
 def test_a_folder_is_refused(tmp_path):
     with pytest.raises(InputError, match="a folder; give a weights file"):
         load_predictor(tmp_path)
-
-
-@pytest.mark.parametrize(("hidden", "dropout"), [((), 0.3), ((4, 0), 0.3), ((4,), 1.0)])
-def test_a_network_without_width_or_with_all_units_dropped_is_refused(hidden, dropout):
-    with pytest.raises(InputError, match="a network needs hidden layers"):
-        check_shape(hidden, dropout)
