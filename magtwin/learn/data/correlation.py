@@ -45,14 +45,8 @@ def correlations(x: ArrayLike, y: ArrayLike, features: Sequence[str], groups: Ar
     sd^2 = (G - 1) / G sum over g of (rho_-g - mean)^2, with rho_-g from the rows outside group g, which keep
     their ranks among all rows.
 
-    Args:
-        x: Inputs, shape (N, F).
-        y: Labels [nT], shape (N,).
-        features: Names of the inputs, F of them.
-        groups: Recording or session of each row, whole numbers, shape (N,).
-
-    Raises:
-        InputError: There are fewer than three rows, or the label never varies.
+    Rows are inputs (N, F) with F names, labels [nT], and recordings or sessions as whole numbers. Fewer than
+    three rows, and labels that never vary, are refused.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     group, b = np.unique(groups, return_inverse=True)[1], _ranks(y)

@@ -37,13 +37,7 @@ class HeldOut:
 
 
 def held_out_errors(rows: Rows, error_nt: Array, recordings: Sequence[Recording]) -> list[HeldOut]:
-    """Split errors by recording.
-
-    Args:
-        rows: The rows of the errors.
-        error_nt: Predicted minus measured [nT], shape (N,).
-        recordings: The recordings of the data set.
-    """
+    """Split errors [nT], shape (N,), of rows by their recordings."""
     by_name = {recording.name: recording for recording in recordings}
     errors = []
     for number, name in enumerate(rows.names):

@@ -89,16 +89,8 @@ class Truth:
     ) -> Array:
         """D1 to D6 of the module, by `TERMS`, shape (6, len(rows)) [nT].
 
-        Args:
-            name: Name of the run; a name always stands for the same run and rows.
-            run: Needs the true pose p_world_base with yaw, and b_truth_nt.
-            rows: Numbers of readings.
-            map_nt: The map at the assumed place of the sensor, at these readings [nT].
-            alignment: Lever arm and latency of that place.
-            b_nt: The readings [nT].
-
-        Raises:
-            InputError: The run has no truth.
+        `map_nt` and `b_nt` are the map at the assumed place of the sensor, and the readings, at these rows. A
+        name always stands for the same run and rows. A run without the truth is refused.
         """
         for column in ("p_world_base", "yaw", "b_truth_nt"):
             if column not in run or not np.isfinite(run[column]).any():
@@ -145,17 +137,9 @@ def at_rest_nt(scene: Scene, p_xy: Array, yaw: Array) -> Array:
 def budget(
     evaluation: Evaluation, m: int, truth: Truth, train: Dataset, names: Sequence[str] | None = None
 ) -> Budget:
-    """Error budget of a model of an evaluation.
+    """Error budget of model `m` of an evaluation: `magtwin.error_budget` for one model.
 
-    Args:
-        evaluation: The evaluation.
-        m: Number of the model.
-        truth: The twin that made the recordings and the training recordings.
-        train: Training recordings, for the expectations.
-        names: Which of them. Default: all.
-
-    Raises:
-        InputError: A recording has no truth, or is of another scene.
+    The expectations are fitted to the recordings `names` of `train`, by default to all.
     """
     candidate = evaluation.candidates[m]
     inputs = _inputs(candidate, evaluation, train)

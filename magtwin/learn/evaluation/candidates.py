@@ -63,13 +63,7 @@ class NamedMap(Summarized):
 
 
 def named_map(name: str, anomaly_map: AnomalyMap, *checksums: str) -> NamedMap:
-    """A map with its checksums.
-
-    Args:
-        name: What to call it.
-        anomaly_map: The map.
-        checksums: SHA-256 of its file, if it has one. That of its values is added.
-    """
+    """A map with its checksums: the SHA-256 of its file, if it has one, and that of its values."""
     return NamedMap(name, anomaly_map, frozenset({*filter(None, checksums), values_sha256(anomaly_map)}))
 
 
@@ -166,17 +160,10 @@ def tolles_lawson(
     *,
     alignment: Alignment | None = None,
 ) -> Candidate:
-    """A ridge regression of Tolles and Lawson's kind: heading, motion and currents.
+    """A ridge regression of Tolles and Lawson's kind, on heading, motion and currents.
 
-    Args:
-        named: The map.
-        dataset: Training recordings, which are labelled on it.
-        names: Which of them. Default: all.
-        alignment: Lever arm and latency. Default: those of the data set if it was labelled on this map, else
-            0.
-
-    Raises:
-        InputError: A recording has no label on the map.
+    It is fitted to recordings of a data set, labelled on a map with a lever arm and latency; default: those
+    of the data set if it was labelled on this map, else 0.
     """
     given = alignment is not None
     alignment = alignment or _alignment_on(dataset, named.checksums)

@@ -78,17 +78,10 @@ def labelled_drive(
     rate_hz: float | None = RATE_HZ,
     name: str = "the drive",
 ) -> LabelledDrive:
-    """Features and labels of a drive, with the lever arm and latency in a model's metadata.
+    """Features and labels of a drive on a map, with the lever arm and latency in a model's metadata.
 
-    Args:
-        model: The model.
-        run: The drive, with poses and measured field.
-        field: The map.
-        rate_hz: Highest rate of the readings [Hz]. None: all.
-        name: What to call the drive in an error.
-
-    Raises:
-        InputError: The drive has no label on the map, its field comes from a network, or it lacks a column.
+    At most `rate_hz` readings a second are taken. A drive without labels on the map, with readings of a
+    network, or without a column of the model is refused by its `name`.
     """
     run = read(Source("drive", lambda: run))
     try:

@@ -104,15 +104,7 @@ def report_onnx(path: str | os.PathLike[str]) -> Report:
 
 
 def model_of(predictor: Predictor, *, weights_sha256: str = "") -> "onnx.ModelProto":
-    """The graph of a predictor, with its metadata.
-
-    Args:
-        predictor: Of any kind that a weights file holds.
-        weights_sha256: Checksum of its weights file, for the metadata.
-
-    Raises:
-        InputError: Another kind, or onnx is not installed.
-    """
+    """The graph of a predictor of magtwin's kinds, with its metadata."""
     onnx = _onnx()
     graph = _Graph(onnx)
     mean, sd = graph.predictor(predictor)

@@ -115,13 +115,9 @@ class Sums:
 
 
 def sums_of(phi: Array, y: Array, variance_nt2: ArrayLike, weight: ArrayLike = 1.0) -> Sums:
-    """Sums of readings.
+    """Sums of readings: regressors (N, P), labels [nT], (N,), and variances of their errors [nT^2].
 
-    Args:
-        phi: Regressors, shape (N, P).
-        y: Labels [nT], shape (N,).
-        variance_nt2: Variance of each error [nT^2], shape (N,) or one for all.
-        weight: Share of an independent reading that each counts for, shape (N,) or one for all.
+    `weight` is the share of an independent reading that each counts for.
     """
     weight = np.broadcast_to(np.asarray(weight, float), y.shape)
     share = weight / np.broadcast_to(np.asarray(variance_nt2, float), y.shape)
@@ -217,12 +213,7 @@ class DriveEffects(NamedTuple):
 def effects_of_drive(prior: Effects, phi: Array, y: Array, variance_nt2: Array, t: Array) -> DriveEffects:
     """Effects of a session from a labelled drive.
 
-    Args:
-        prior: Effects of all sessions.
-        phi: Regressors, shape (N, P).
-        y: Labels [nT], shape (N,).
-        variance_nt2: Variance of each label's error [nT^2], shape (N,).
-        t: Times since the start of the drive [s], ascending, shape (N,).
+    Its rows are regressors (N, P), labels [nT], variances of their errors [nT^2], and ascending times [s].
     """
     weight = shares(t)
     block = ((t - t[0]) // BLOCK_S).astype(np.intp)
@@ -362,13 +353,8 @@ def followed(
 ) -> tuple[Array, Array]:
     """Predictions of the rows of a drive whose poses become known `effects.delay_s` later.
 
-    Args:
-        effects: Filter to update.
-        phi: Regressors, shape (N, P).
-        y: Labels [nT], shape (N,); nan if unknown.
-        variance_nt2: Variance of the error of each label [nT^2], shape (N,).
-        t: Times [s], ascending, shape (N,).
-        predicted_nt2: Variance of the errors to predict. Default: `variance_nt2`.
+    Its rows are regressors (N, P), labels [nT], nan if unknown, variances of their errors [nT^2], and
+    ascending times [s]. `predicted_nt2` are the variances of the errors to predict, by default the same.
 
     Returns:
         Disturbances and their standard deviations [nT], with the filter's widening, each (N,).

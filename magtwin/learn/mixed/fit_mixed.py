@@ -28,7 +28,6 @@ from magtwin.learn.mixed.mixed import FACTORS, Mixed, mixed_of
 from magtwin.learn.models.calibration import Spread, quantile_factor
 from magtwin.learn.models.linear import fit_linear
 from magtwin.learn.models.predictor import Fit, FitTask
-from magtwin.learn.models.weights import Weights
 
 DRIVE_S = 60.0
 """Length of the drive with which the factor of calibrated models is fitted [s]."""
@@ -48,6 +47,7 @@ class Mixeds:
 
     description = "A linear model whose coefficients differ between sessions (a mixed model)"
     options = MappingProxyType({"features": "session", "penalty": None, "weighting": "none"})
+    load = staticmethod(mixed_of)
 
     @staticmethod
     def fit(task: FitTask) -> Fit:
@@ -96,11 +96,6 @@ class Mixeds:
         model.families = len({drive.family for drive in learned})
         model.factors = fitter.factors()
         return Fit(model)
-
-    @staticmethod
-    def load(weights: Weights) -> Mixed:
-        """The mixed model of a weights file."""
-        return mixed_of(weights)
 
 
 @dataclass(frozen=True)

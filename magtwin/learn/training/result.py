@@ -122,13 +122,7 @@ class TrainingResult(Summarized):
 
 
 def model_card(result: TrainingResult, name: str, checksum: str) -> str:
-    """The card of a trained model.
-
-    Args:
-        result: The model with its errors.
-        name: Name of the weights file.
-        checksum: Its SHA-256.
-    """
+    """The card of a trained model, whose weights file has a name and a SHA-256."""
     predictor, metadata = result.predictor, result.predictor.metadata
     what = (
         "Predicts what a robot adds to a map of the magnetic field at its magnetometer [nT]. "
@@ -158,14 +152,7 @@ def model_card(result: TrainingResult, name: str, checksum: str) -> str:
 
 
 def widened_card(card: str, before: str, after: str, predictor: Predictor) -> str:
-    """The card of a model that `magtwin network widen` made of another.
-
-    Args:
-        card: The card of the other.
-        before: SHA-256 of its weights file.
-        after: SHA-256 of the new one.
-        predictor: The new model.
-    """
+    """The card of a model that `magtwin network widen` made of another: its card with the new SHA-256."""
     robots, readings = (predictor.metadata[f"wide_{name}"] for name in ("robots", "readings"))
     sd = 0.0 if predictor.wide is None else predictor.wide.mean_nt
     text = (

@@ -191,11 +191,7 @@ def _outcome(fitted: Fit, parts: Sequence[PartErrors]) -> dict[str, MetadataValu
 
 
 def device_of(config: TrainConfig) -> str:
-    """Where torch trains: "cpu" or "cuda".
-
-    Raises:
-        InputError: The configuration asks for a GPU and torch has none.
-    """
+    """Where torch trains: "cpu" or "cuda"; a GPU that torch does not see is refused."""
     if config.device == "cuda" and not torch.cuda.is_available():
         raise InputError("device cuda: this torch sees no GPU; install one that does, or take `device=auto`")
     return "cuda" if config.device != "cpu" and torch.cuda.is_available() else "cpu"
@@ -241,10 +237,7 @@ def _ridge(dataset: Dataset, rows: RowsOf, groups: NDArray[np.intp]) -> dict[Par
 
 
 def _held_out(rows: RowsOf, dataset: Dataset, fitted: Fit) -> list[HeldOut]:
-    """Errors on recordings that the model was not fitted to.
-
-    These are validation and test, and training if the model was fitted without each of its groups in turn.
-    """
+    """Errors on validation and test, and on training if each of its groups was left out of a fit in turn."""
     errors = []
     for part, of in rows.items():
         predicted = fitted.held_out_nt if part == "train" else fitted.model.predict(of.x)[0]

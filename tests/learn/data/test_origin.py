@@ -17,7 +17,6 @@ from magtwin.sim.runs.simulate import robot_metadata
 from magtwin.sim.session import draw_session
 from magtwin.spec.sensors import MocapSpec
 from magtwin.twin import in_session, open_twin, sweep
-from magtwin.twin.opening import _platform_sha256
 from magtwin.usd.maps.layer import save_map
 from magtwin.usd.robot import load_robot
 
@@ -205,21 +204,3 @@ def test_a_command_says_each_mismatch_once_on_stderr_and_info_shows_it(lab_scene
     assert "WRONG ROBOT" in shown.out
     main(["info", str(out / "run.parquet")])
     assert "WRONG ROBOT" in capsys.readouterr().out
-
-
-def test_a_platform_is_another_when_a_figure_changes_and_not_when_one_is_added_at_its_default():
-    changed = dataclasses.replace(ROBOT.platform, hard_iron_nt=(0.0, 0.0, 1.0))
-    own, other = (
-        _platform_sha256(dataclasses.replace(ROBOT, platform=one)) for one in (ROBOT.platform, changed)
-    )
-    assert own != other
-    assert own == _platform_sha256(dataclasses.replace(ROBOT, name="burger"))
-
-    @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Later(type(ROBOT.platform)):
-        added_nt: float = 0.0
-
-    later = Later(**{f.name: getattr(ROBOT.platform, f.name) for f in dataclasses.fields(ROBOT.platform)})
-    assert _platform_sha256(dataclasses.replace(ROBOT, platform=later)) == own
-    magnetic = dataclasses.replace(later, added_nt=3.0)
-    assert _platform_sha256(dataclasses.replace(ROBOT, platform=magnetic)) != own

@@ -275,8 +275,3 @@ def test_two_of_one_name_are_refused():
         judged([FLAT, FLAT])
     with pytest.raises(InputError, match="two recordings are called 'one'"):
         judged([FLAT], trial(), trial())
-
-
-def test_nothing_to_judge_by_is_refused():
-    with pytest.raises(InputError, match="nothing to evaluate"):
-        evaluate([], [], baseline=FLAT, rng=np.random.default_rng(0))

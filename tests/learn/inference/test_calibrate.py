@@ -1,6 +1,7 @@
 """Mixed models from a data set, calibrated by a drive, followed online, and used like any predictor."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -199,27 +200,15 @@ def test_a_poor_drive_is_warned_of(model):
     for run, options, text in (
         (a_run(3, seconds=20.0), {}, "it lasts 20 s, and 30 s are needed"),
         (a_run(3, sector=np.pi / 4), {}, "its headings lie in 2 of 12 sectors"),
-        (
-            a_run(3),
-            {"pose_from_map": True},
-            "were estimated on the magnetic map, so the calibration is circular",
-        ),
+        (a_run(3), {"pose_from_map": True}, "were estimated on the magnetic map"),
         (Run(dict(a_run(3)), {"pose_from_map": True}), {}, "were estimated on the magnetic map"),
     ):
         with pytest.warns(CalibrationWarning, match=text) as given:
             calibrated = mt.calibrate(model, run, anomaly_map=FIELD, **options)
         assert len(given) == 1
         assert text.split(",")[0] in calibrated.metadata["calibration_warnings"]
-    other = AnomalyMap(
-        values_nt=FIELD.values_nt[:, ::-1],
-        origin_m=(-3.0, -3.0),
-        cell_m=(0.5, 0.5),
-        headings_rad=np.zeros(1),
-        name="b",
-    )
-    with pytest.warns(
-        CalibrationWarning, match="trained on the map 'trough' and is calibrated on another, 'b'"
-    ):
+    other = replace(FIELD, values_nt=FIELD.values_nt[:, ::-1], name="b")
+    with pytest.warns(CalibrationWarning, match="trained on the map 'trough' and is calibrated on another"):
         mt.calibrate(model, a_run(3), anomaly_map=other)
 
 
@@ -308,14 +297,8 @@ def test_training_needs_sessions_and_a_nominal_plant(tmp_path):
 def test_the_commands_calibrate_and_refuse_to_widen_what_is_wide(weights, tmp_path, capsys):
     a_run(7, "hysteresis", seconds=20.0).save(tmp_path / "drive.parquet")
     mt.save_map(FIELD, tmp_path / "map.usdc")
-    words = [
-        weights,
-        tmp_path / "drive.parquet",
-        "--map",
-        tmp_path / "map.usdc",
-        "--out",
-        tmp_path / "now.safetensors",
-    ]
+    words = [weights, tmp_path / "drive.parquet", "--map", tmp_path / "map.usdc", "--out"]
+    words.append(tmp_path / "now.safetensors")
     main(["calibrate", *map(str, words), "--json"])
     out, err = capsys.readouterr()
     assert "it lasts 20 s" in err

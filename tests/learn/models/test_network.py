@@ -37,34 +37,8 @@ def a_net(features=FULL, hidden=(8, 4), seed=0, **options):
     )
 
 
-@pytest.mark.parametrize("hidden", [(512, 512, 512, 512), (512, 512, 512, 128), (3,)])
-def test_the_file_alone_tells_the_architecture(tmp_path, hidden):
-    net = a_net(hidden=hidden)
-    net.save(tmp_path / "n.safetensors")
-    again = load_predictor(tmp_path / "n.safetensors")
-    assert again.hidden == hidden
-    for name, value in net.tensors().items():
-        assert_array_equal(again.tensors()[name], value)
-
-
 def test_the_papers_network_has_799233_parameters():
     assert a_net(hidden=TrainConfig().options["layers"]).parameters_count == 799_233
-
-
-def test_what_is_known_of_a_network_survives_the_file(tmp_path):
-    net = a_net(
-        ["yaw_deg", "odom_v_x"], dropout=0.1, residual_sd_nt=12.5, metadata={"source": "here", "rows": 7}
-    )
-    net.save(tmp_path / "n.safetensors")
-    again = load_predictor(tmp_path / "n.safetensors")
-    assert again.features == ("yaw_deg", "odom_v_x")
-    assert (again.dropout, again.residual_sd_nt, again.metadata) == (0.1, 12.5, {"source": "here", "rows": 7})
-
-
-def test_one_network_gives_one_file_byte_for_byte(tmp_path):
-    for name in ("a", "b"):
-        a_net(metadata={"z": 1, "a": 2}).save(tmp_path / name)
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 def test_a_weights_file_has_the_rights_of_any_new_file(tmp_path):
@@ -110,16 +84,6 @@ def test_the_released_network_converts_once_and_stays_itself(real_data, tmp_path
     assert net.metadata["source_sha256"] == "2418abc80cb0eab578e1e8af35f53566db2efa84b1cfa5257710d15273a07cf0"
     assert math.isnan(net.residual_sd_nt)
     assert np.isnan(net.inputs.low).all()
-
-
-def test_an_output_that_exists_is_refused_unless_forced(real_data, tmp_path):
-    out = tmp_path / "n.safetensors"
-    out.write_bytes(b"precious")
-    with pytest.raises(InputError, match="exists already; give `force=True`"):
-        convert(real_data / RELEASED, out)
-    assert out.read_bytes() == b"precious"
-    convert(real_data / RELEASED, out, force=True)
-    assert load_predictor(out).hidden == (512, 512, 512, 128)
 
 
 # Files that are refused

@@ -9,7 +9,7 @@ from learn_drives import random_run as a_run
 from numpy.testing import assert_allclose, assert_array_equal
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
-from test_network import RELEASED, a_net
+from test_network import a_net
 
 from magtwin.errors import InputError
 from magtwin.learn.data.features import SETS, features
@@ -87,13 +87,6 @@ def test_a_file_that_is_there_is_kept(predictor, tmp_path):
         predictor.save(tmp_path / "a.safetensors")
 
 
-def test_every_kind_tells_what_it_is(predictor):
-    figures = {figure.name: figure.value for figure in predictor.report("p").figures}
-    assert figures["residual sd"] == 44.0
-    assert predictor.parameters_count > 0
-    assert predictor.layers_text
-
-
 def test_a_magnetometer_tells_of_each_row_its_own_spread(predictor):
     run = a_run(40)
     x = features(run, NAMES)
@@ -105,10 +98,6 @@ def test_a_magnetometer_tells_of_each_row_its_own_spread(predictor):
     assert (len(np.unique(sd)) == 1) == (predictor.kind == "mlp")
 
 
-def test_the_metadata_of_a_run_tell_the_kind_where_it_is_no_perceptron(predictor):
-    assert NeuralMagnetometer(predictor).metadata.get("network_kind", "mlp") == predictor.kind
-
-
 def test_runs_in_one_stream_are_read_as_if_each_were_alone(predictor):
     runs = [a_run(rows, seed).with_columns(t=np.arange(rows) / 135) for seed, rows in enumerate((30, 1, 520))]
     magnetometer = NeuralMagnetometer(predictor)
@@ -116,10 +105,6 @@ def test_runs_in_one_stream_are_read_as_if_each_were_alone(predictor):
         (alone,) = magnetometer.read([run])
         assert_array_equal(read.disturbance_nt, alone.disturbance_nt)
         assert_array_equal(read.sd_nt, alone.sd_nt)
-
-
-def test_a_released_checkpoint_is_a_predictor(real_data):
-    assert load_predictor(real_data / RELEASED).kind == "mlp"
 
 
 def test_a_simulation_is_read_by_any_kind_and_many_as_one(lab_scene, tmp_path):
