@@ -75,12 +75,7 @@ class Truth:
     """Exact fields of a twin along a run, and their parts of a model's error."""
 
     def __init__(self, surveyed: Scene, scene_of: Callable[[str, Run], Scene]) -> None:
-        """Use a twin.
-
-        Args:
-            surveyed: The scene, with its robot as in the survey.
-            scene_of: From a run's name and the run to the scene with its robot as in the run's session.
-        """
+        """Use a scene with its robot as in the survey, and that with its robot as in the session of a run."""
         self.surveyed, self.scene_of = surveyed, scene_of
         self._exact: dict[tuple[str, Alignment | None], Array] = {}
 
@@ -116,12 +111,8 @@ class Truth:
 def at_rest_nt(scene: Scene, p_xy: Array, yaw: Array) -> Array:
     """Exact field magnitude at the magnetometer of a robot at rest with its LiDAR off [nT], shape (N,).
 
-    It is that of `magtwin.sim.survey.field_at_rest_nt` within 1e-3 nT; nan if the pose is nan.
-
-    Args:
-        scene: The scene.
-        p_xy: Positions of base_link [m], shape (N, 2).
-        yaw: Headings [rad], shape (N,).
+    It is that of `magtwin.sim.survey.field_at_rest_nt` within 1e-3 nT; nan if the pose of base_link, (N, 2)
+    [m] and (N,) [rad], is nan.
     """
     pose = np.column_stack([p_xy, yaw])
     known = np.isfinite(pose).all(axis=1)
