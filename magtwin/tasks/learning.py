@@ -184,7 +184,8 @@ def evaluate(
     if seed < 0:
         raise InputError(f"seed must be a whole number from 0 up, got {seed!r}")
     maps = _named_maps([anomaly_map] if _single(anomaly_map) else anomaly_map)  # type: ignore[arg-type,list-item]
-    given: list[Any] = [models] if _single(models) or _is_model(models) else list(models)  # type: ignore[arg-type]
+    alone = _single(models) or isinstance(models, Candidate | Predictor)
+    given: list[Any] = [models] if alone else list(models)  # type: ignore[arg-type]
     files = iter(short_names([Path(model) for model in given if _single(model)]))
     candidates = []
     for model in given:
@@ -379,10 +380,6 @@ def short_names(files: Sequence[Path]) -> list[str]:
 
 def _single(value: Any) -> bool:
     return isinstance(value, str | os.PathLike | AnomalyMap)
-
-
-def _is_model(value: Any) -> bool:
-    return isinstance(value, Candidate) or hasattr(value, "predict")
 
 
 def _dataset(dataset: Dataset | File) -> Dataset:

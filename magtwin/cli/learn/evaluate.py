@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -105,7 +105,7 @@ def evaluate(
             seed=seed,
             progress=advance,
         )
-    budgets = ()
+    budgets: tuple[Any, ...] = ()
     if scene is not None and train is not None:
         with progress("Error budgets", "models") as advance:
             budgets = error_budget(evaluation, scene, train, progress=advance)

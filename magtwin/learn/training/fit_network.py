@@ -76,7 +76,8 @@ def train(
         InputError: Constant labels, training diverged, or an `init` of other inputs or layers.
     """
     x, y, x_val, y_val = (np.ascontiguousarray(part, float) for part in (x, y, x_val, y_val))
-    counts = None if weight is None else np.array(weight, float) / np.mean(weight)
+    counts = None if weight is None else np.array(weight, float)
+    counts = None if counts is None else counts / counts.mean()
     if y.std() < 1e-9:
         raise InputError(f"the label is {y[0]:g} nT in every training row; there is nothing to learn")
     if device == "cpu":
