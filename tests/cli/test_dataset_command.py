@@ -97,26 +97,6 @@ def test_a_table_of_another_program_is_read_by_its_own_names_of_columns(recorded
     assert np.isfinite(found["label_nt"]).any()
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--column", "t=tim"], "no column 'tim'; did you mean 'time'"),
-        (["--column", "time"], "--column takes NAME=THEIRS, such as yaw=heading, each once, got 'time'"),
-        (
-            ["--column", "t=time", "--column", "yaw=time"],
-            "--column names one column twice, got t=time yaw=time",
-        ),
-    ],
-)
-def test_columns_that_a_table_lacks_or_that_are_named_twice_are_refused(tmp_path, capsys, words, said):
-    (tmp_path / "theirs.csv").write_text("time,B\n0,1\n1,2\n")
-    files = [str(tmp_path / "theirs.csv"), "--map", str(MAP), "--out", str(tmp_path / "set")]
-    with pytest.raises(SystemExit):
-        main(["dataset", "build", *files, *words])
-    assert said in capsys.readouterr().err
-    assert not (tmp_path / "set").exists()
-
-
 def test_a_folder_of_runs_stands_for_its_runs_and_their_sessions(recorded, tmp_path, capsys):
     (tmp_path / "runs").mkdir()
     run = read_run(recorded / "c.parquet")

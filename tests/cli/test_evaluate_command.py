@@ -9,7 +9,6 @@ from learn_drives import HILLS, a_drive, hills
 from places import DOCS
 
 from magtwin.cli import main
-from magtwin.errors import InputError
 from magtwin.files.file import sha256
 from magtwin.io.formats import write_run
 from magtwin.io.provenance import made_again
@@ -180,9 +179,3 @@ def test_two_drives_of_one_path_lie_over_each_other_once_they_are_aligned(lab_sc
     drift = {how: np.abs(np.subtract(*getattr(speeds, how).fields["b_truth_nt"])).mean()
              for how in ("recorded", "placed")}  # fmt: skip
     assert drift["recorded"] > 5 * drift["placed"]  # as in the paper's Figure 8
-
-
-def test_a_run_that_cannot_be_driven_again_is_refused(lab_scene):
-    run = a_run(0, "figure8")
-    with pytest.raises(InputError, match="the metadata of the run are incomplete"):
-        made_again(run, lab_scene, engine="kinematic", seed=1)

@@ -20,7 +20,6 @@ from magtwin.learn.data.dataset import build_dataset, open_dataset
 from magtwin.learn.data.features import features
 from magtwin.learn.data.split import LEAK
 from magtwin.learn.models.predictor import load_predictor
-from magtwin.learn.training.config import read_config
 from magtwin.learn.training.fit_network import Descent
 
 
@@ -91,14 +90,6 @@ def test_the_card_tells_checksum_errors_by_path_and_how_to_repeat(trained):
     assert "| test, path eight | 1 | 200 |" in card
     assert "Test: f, g." in card
     assert "Warning" not in card
-
-
-def test_the_configuration_in_the_weights_repeats_them_to_the_byte(data, trained, tmp_path):
-    (tmp_path / "c.toml").write_text(load_predictor(trained).metadata["config"])
-    assert read_config(tmp_path / "c.toml").hold_out == ("f", "g")
-    again = tmp_path / "g.safetensors"
-    main(["train", str(data), "--out", str(again), "--config", str(tmp_path / "c.toml"), "--json"])
-    assert again.read_bytes() == trained.read_bytes()
 
 
 def test_the_learning_curve_is_drawn(trained):

@@ -118,13 +118,6 @@ def test_an_alignment_is_fitted_to_all_runs_together_and_kept(tmp_path):
     assert sds[0] < sds[1]
 
 
-def test_a_lower_rate_keeps_every_second_row(tmp_path):
-    found = build_dataset({"a": RUNS["a"]}, FIELD, tmp_path / "d", rate_hz=5.0)
-    ((one, run),) = found.runs()
-    assert one.rows == 120
-    assert_array_equal(run["t"], RUNS["a"]["t"][::2])
-
-
 @pytest.mark.parametrize("lost", ["field", "lock", "pose"])
 def test_a_lower_rate_keeps_labels_where_every_second_reading_is_lost(tmp_path, lost):
     run = RUNS["a"]

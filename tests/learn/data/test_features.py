@@ -11,7 +11,6 @@ from magtwin.learn.data.features import (
     FULL,
     INDUCED,
     SETS,
-    columns_of,
     feature_names,
     features,
     warming,
@@ -129,13 +128,6 @@ def test_nothing_in_circular_tells_one_session_from_another():
         assert_array_equal(features(other, name), features(run, name))
 
 
-def test_gradient_features_are_those_of_a_lever_arm_and_of_a_latency():
-    run = a_run()
-    x = features(run, ["map_gradient_left", "speed_map_gradient_forward"])
-    assert_array_equal(x[:, 0], run["b_map_gradient_nt_m"][:, 1])
-    assert_array_equal(x[:, 1], run["b_map_gradient_nt_m"][:, 0] * run["odom_v"][:, 0])
-
-
 def test_the_size_of_the_measured_vector_is_in_no_feature():
     """It is what is to be predicted."""
     run = a_run()
@@ -161,12 +153,6 @@ def test_induced_and_eddy_products_are_those_of_tolles_and_lawson_in_a_field_tha
 def test_a_field_of_nothing_has_no_direction():
     run = a_run(3).with_columns(b_vector_measured_nt=np.zeros((3, 3)))
     assert np.isnan(features(run, ["cosine_x", "induced_xx"])).all()
-
-
-def test_columns_of_a_set_are_all_that_it_needs():
-    for name in SETS:
-        run = a_run().select(*columns_of(name))
-        assert features(run, name).shape == (50, len(SETS[name]))
 
 
 def test_names_in_one_text_are_a_set_a_feature_or_several_with_commas():

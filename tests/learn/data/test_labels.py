@@ -127,13 +127,6 @@ def test_lever_arm_and_latency_are_found_together_to_their_stated_spread():
     assert (sd < 0.01).all()
 
 
-def test_an_alignment_is_found_where_every_second_reading_is_lost():
-    runs = [a_run((0.04, -0.03), seed=k, swing=0.5 + k, rate=40) for k in range(2)]
-    lost = np.arange(runs[0].rows) % 2 == 0
-    gaps = [run.with_columns(b_measured_nt=np.where(lost, np.nan, run["b_measured_nt"])) for run in runs]
-    assert_allclose(fit_alignment(gaps, FIELD).lever_arm_m, (0.04, -0.03), atol=0.004)
-
-
 def test_errors_shared_within_groups_make_the_spread_of_students_t():
     rng, x, group = np.random.default_rng(0), np.ones((60, 1)), np.repeat(np.arange(6), 10)
     within = 0

@@ -77,16 +77,6 @@ def test_another_map_is_told_with_the_rms_difference_of_the_two(other, rms):
     assert not one.grave
 
 
-def test_maps_of_different_floors_are_told_as_such():
-    far = dataclasses.replace(a_map(), origin_m=(50.0, 50.0))
-    assert "cover different floors" in found(learned(), field=far, map_sha256="b" * 64)[0].text
-
-
-def test_a_network_that_does_not_say_its_map_is_told_mildly():
-    (one,) = found({})
-    assert "does not name the map that it was trained on" in one.text
-
-
 def test_unaligned_labels_are_told_with_the_effect_of_the_place_where_they_took_the_map():
     robot = dataclasses.replace(ROBOT, mocap=MocapSpec(offset_m=(0.06, 0.0), latency_s=0.0, jitter_s=0.0))
     (one,) = found(learned(robot=robot, poses="mocap"))

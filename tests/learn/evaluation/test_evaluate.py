@@ -247,13 +247,6 @@ def test_a_run_that_cannot_judge_is_refused(change, text):
         judged([FLAT], trial(run=change(a_run(2, path="figure8"))))
 
 
-def test_a_run_without_an_input_is_refused_with_the_near_name(weights):
-    run = a_run(2, path="figure8")
-    bare = Run({name: v for name, v in run.items() if name != "odom_v"}, run.metadata)
-    with pytest.raises(InputError, match=r"one: line\.safetensors: no column 'odom_v'; did you mean 'odom_"):
-        judged([FLAT, candidate_of(weights[0], [HILLS])], trial(run=bare))
-
-
 def test_readings_on_no_common_ground_are_refused_with_counts():
     left, right = (np.ones((1, 33, 41), bool) for _ in range(2))
     left[0, :, 21:] = False
@@ -263,11 +256,6 @@ def test_readings_on_no_common_ground_are_refused_with_counts():
         InputError, match=r"no reading that every model can be judged on: \d+ have no label on"
     ):
         judged([Candidate(one.name, Mean(0.0, 1.0), one) for one in halves])
-
-
-def test_a_path_that_is_called_as_a_total_is_told_from_it():
-    runs = [trial("a", a_run(0, path="all")), trial("b", a_run(1, path="sine"))]
-    assert [case.name for case in judged([FLAT], *runs).cases] == ["path all", "sine", "all", "mean"]
 
 
 def test_two_of_one_name_are_refused():

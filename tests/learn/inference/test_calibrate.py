@@ -106,16 +106,6 @@ def test_a_minute_of_labels_makes_a_new_plant_as_good_as_its_noise(model):
     assert 0.85 < np.mean(held) < 0.97
 
 
-def test_a_drive_keeps_its_labels_where_every_third_reading_is_lost(model):
-    run = a_run(200, "hysteresis")
-    lost = np.arange(run.rows) % 3 == 0  # among them the one at each step of 0.25 s
-    gaps = run.with_columns(b_measured_nt=np.where(lost, np.nan, run["b_measured_nt"]))
-    whole, left = (labelled_drive(model, each, FIELD) for each in (run, gaps))
-    assert len(left.y) == len(whole.y)
-    assert np.isfinite(left.y[1:]).all()
-    assert left.y[1:].mean() == pytest.approx(whole.y.mean(), abs=15)
-
-
 def test_intervals_for_an_unknown_plant_hold_where_nominal_ones_fail(model):
     runs = [a_run(seed, "hysteresis") for seed in range(200, 230)]
     held = {}

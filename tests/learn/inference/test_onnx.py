@@ -94,17 +94,6 @@ def test_info_tells_what_a_file_holds_and_runs_nothing_of_it(exported, capsys):
     assert list(told["metadata"]["features"]) == ["yaw_deg", "odom_w_z", "battery_v"]
 
 
-def test_the_command_says_what_it_wrote_and_replaces_nothing_unasked(weights, tmp_path, capsys):
-    out = tmp_path / "n.onnx"
-    main(["network", "export", str(weights), "--out", str(out)])
-    assert f"Wrote {out}" in capsys.readouterr().out
-    with pytest.raises(InputError, match="exists already"):
-        export_onnx(weights, out)
-    with pytest.raises(SystemExit):
-        main(["network", "export", str(weights), "--out", str(tmp_path / "n.txt")])
-    assert "an ONNX file ends in .onnx" in capsys.readouterr().err
-
-
 def test_what_is_no_onnx_file_of_magtwins_is_refused(tmp_path):
     (tmp_path / "bad.onnx").write_bytes(b"no protobuf\xff" * 9)
     with pytest.raises(InputError, match=r"bad\.onnx: no ONNX file, or damaged"):

@@ -54,18 +54,6 @@ def test_the_posterior_is_that_of_regression_in_the_space_of_readings():
     assert_allclose(found[1], spread, rtol=1e-7)
 
 
-def test_sums_of_parts_add_up_and_no_reading_leaves_the_prior():
-    prior = a_prior()
-    phi, y, variance = a_session(prior, 30, 1)
-    parts = [sums_of(phi[at], y[at], variance[at], 0.2) for at in (slice(0, 11), slice(11, 30))]
-    whole, added = sums_of(phi, y, variance, 0.2), parts[0] + parts[1]
-    for name in vars(whole):
-        assert_allclose(getattr(added, name), getattr(whole, name), rtol=1e-12)
-    none = posterior(prior, sums_of(phi[:0], y[:0], variance[:0]))
-    assert_allclose(none.mean, prior.mean, rtol=1e-9)
-    assert_allclose(none.covariance, prior.covariance, rtol=1e-7)
-
-
 def test_a_prediction_does_not_depend_on_other_rows_to_the_bit():
     effects, phi = a_prior(), np.random.default_rng(3).normal(size=(600, P))
     mean, variance = effects.predict(phi)
@@ -112,13 +100,6 @@ def test_a_drive_in_blocks_has_the_posterior_of_all_its_readings():
     expected = posterior(prior, sums_of(phi, y, variance, shares(t)))
     assert_allclose(drive.effects.mean, expected.mean, rtol=1e-9)
     assert drive.left_out_nt == pytest.approx(20.0, rel=0.4)
-
-
-def test_a_drive_whose_noise_is_greater_than_thought_widens_its_intervals():
-    prior, t = a_prior(size=5.0), np.arange(240) / 4
-    phi, y, variance = a_session(prior, 240, 6)
-    calm = effects_of_drive(prior, phi, y, variance, t).widening
-    assert effects_of_drive(prior, phi, y, variance / 9, t).widening > 2 * calm
 
 
 def test_intervals_hold_on_sessions_of_the_prior():

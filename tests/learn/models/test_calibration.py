@@ -85,10 +85,3 @@ def test_the_luck_of_one_validation_day_is_cancelled_by_a_yardstick_held_against
         with_luck.append(quantile_factor(model, sd[last], groups[last]))
     spread = [np.std(factors) / np.mean(factors) for factors in (without, with_luck)]
     assert spread[0] < 0.5 * spread[1]
-
-
-def test_a_factor_of_few_recordings_is_held_within_bounds():
-    error, groups = np.concatenate([np.full(50, 1e-3), np.full(450, 100.0)]), np.repeat(np.arange(10), 50)
-    known = yardstick(error, np.ones(500), groups, groups == 0)
-    factor = transferred_factor(np.full(50, 1e-3), np.ones(50), np.zeros(50, int), known)
-    assert factor == pytest.approx(3 * 1e-3 / Z_90)
