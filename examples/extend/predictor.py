@@ -8,12 +8,11 @@ import numpy as np
 import magtwin as mt
 from magtwin.extend import predictor
 from magtwin.learn.data.inputs import inputs_from, inputs_of, scaler_tensors
-from magtwin.learn.models.predictor import Fit
-from magtwin.learn.models.regressor import Regressor
+from magtwin.learn.models.predictor import Fit, Predictor
 
 
 @dataclass(kw_only=True, repr=False)
-class Mean(Regressor):
+class Mean(Predictor):
     """A constant disturbance with a constant standard deviation."""
 
     values: np.ndarray
@@ -51,7 +50,7 @@ class MeanKind:
         like = {**scaler_tensors(len(weights.features)), "values": np.ones(2)}
         tensors = weights.fit(like)
         inputs = inputs_from(weights.features, tensors, weights.path)
-        return Mean(inputs=inputs, values=tensors["values"], residual_sd_nt=weights.residual_sd_nt)
+        return Mean(inputs=inputs, values=tensors["values"])
 
 
 twin = mt.open_twin(mt.author_scene("lab", out="lab"), magnetometer="physical")

@@ -1,14 +1,9 @@
 """Evaluations: models against recordings as one report, with Table 1 and the figures of the paper."""
 
-import csv
-import os
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
-from magtwin.errors import InputError
 from magtwin.figures.canvas import (
     INK,
     WIDTH_IN,
@@ -24,14 +19,16 @@ from magtwin.figures.canvas import (
     short_name,
 )
 from magtwin.figures.maps import mean_field_ut
-from magtwin.figures.page import Page, Section, Table, write_pages
-from magtwin.figures.training import draw_correlations, label_epochs
-from magtwin.files.file import read_text
+from magtwin.figures.page import Page, Section, Table
+from magtwin.figures.reports import section_of_traversals
+from magtwin.figures.training import draw_correlations
 from magtwin.learn.data.correlation import correlations
 from magtwin.learn.data.features import FEATURES, FULL, features
+from magtwin.learn.evaluation.budget import TERMS, Budget
 from magtwin.learn.evaluation.evaluation import PAPER, Evaluation, Judged
 from magtwin.learn.evaluation.scores import COVERED, DRAWS, LEVEL
 from magtwin.report.verdict import Z_90
+from magtwin.run.compare import Traversals
 
 NAME = "evaluation"
 """Name of the report's files."""
@@ -54,26 +51,19 @@ RANKED_HZ = 10.0
 SHOWN_S = 90.0
 """Length of the part of a run that is shown against time [s]."""
 
-EPOCH, CURVES = "number", {"train_rmse_nt": ("training", "--"), "val_rmse_nt": ("validation", "-")}
-"""Columns of a learning curve as `magtwin train` writes it."""
-
 
 def page_of_evaluation(
     evaluation: Evaluation,
     *,
-    title: str = "Evaluation",
-    curves: Mapping[str, Sequence[Mapping[str, float]]] | None = None,
-    more: Sequence[Section] = (),
-    data: Mapping[str, Any] | None = None,
+    budgets: Sequence[Budget] = (),
+    both: tuple[Traversals, tuple[str, str]] | None = None,
 ) -> Page:
     """The report of an evaluation.
 
     Args:
         evaluation: Result of `magtwin.learn.evaluation.evaluate.evaluate`.
-        title: Title of the page.
-        curves: Learning curves by model name, as `read_curve` gives them.
-        more: Further sections, such as an error budget.
-        data: Figures of these sections for the JSON form.
+        budgets: Error budgets of its models.
+        both: One path driven twice, and the names of the two runs.
     """
     every = evaluation.every
     against = "the exact field" if evaluation.truth else "the reading"
@@ -83,62 +73,26 @@ def page_of_evaluation(
         f"{against}."
     )
     verdicts = [f"{name}: {line}" for name, line in evaluation.verdicts().items()]
-    tables = (_models(evaluation), _maps(evaluation), _left_out(evaluation))
-    a_run = _known(_time_series(evaluation), _floor_plan(evaluation))
-    by_path = _known(_path_errors(evaluation), _learning_curves(evaluation, curves or {}))
+    lost = tuple(evaluation.left_out.items())
+    note = "All models are evaluated on the same readings." if lost else "None."
+    left_out = Table("Readings left out", ("reason", "readings"), lost, note)
+    tables = (_models(evaluation), _maps(evaluation), left_out)
+    a_run, correlated = (_time_series(evaluation), _floor_plan(evaluation)), _rank_correlations(evaluation)
     sections = (
         Section("Table 1", _lead_of_table(evaluation), (), (_table(evaluation),)),
         Section("Models and maps", "", (), tables),
-        Section("Inputs and the disturbance", "", _known(_rank_correlations(evaluation))),
+        Section("Inputs and the disturbance", "", () if correlated is None else (correlated,)),
         Section("A run", "", a_run),
-        Section("Errors by path", "", by_path),
-        *more,
+        Section("Errors by path", "", (_path_errors(evaluation),)),
+        *([_budgets(budgets)] if budgets else []),
+        *([section_of_traversals(*both)] if both else []),
         Section("Every score", "", (), (_intervals(evaluation),)),
     )
     sections = tuple(section for section in sections if section.tables or section.pictures)
-    return Page(title, " ".join([*verdicts, lead]), sections, data={**evaluation.summary(), **(data or {})})
-
-
-def write_evaluation(page: Page, folder: str | os.PathLike[str], *, force: bool = False) -> None:
-    """Write a report as a folder: evaluation.html, .md and .json, and the pictures of the Markdown page.
-
-    Args:
-        page: The report.
-        folder: The folder to make.
-        force: Whether to replace an existing folder.
-
-    Raises:
-        InputError: The folder exists and `force` was not given.
-    """
-    write_pages(page, folder, NAME, force=force)
-
-
-def read_curve(weights: str | os.PathLike[str]) -> tuple[Mapping[str, float], ...]:
-    """The learning curve that `magtwin train` wrote beside weights, by epoch; empty if there is none.
-
-    Args:
-        weights: The weights file.
-
-    Raises:
-        InputError: The CSV file beside the weights is not a learning curve.
-    """
-    path = Path(weights).with_suffix(".csv")
-    if not path.is_file():
-        return ()
-    try:
-        rows = list(csv.DictReader(read_text(path, "learning curve", "text").splitlines()))
-        if not rows or EPOCH not in rows[0]:
-            return ()
-        names = [EPOCH, *(name for name in CURVES if name in rows[0])]
-        return tuple({name: float(row[name]) for name in names} for row in rows)
-    except (OSError, ValueError, TypeError, csv.Error) as error:
-        raise InputError(
-            f"{path}: not a learning curve as `magtwin train` writes it ({error}); move it away"
-        ) from error
-
-
-def _known(*pictures: Picture | None) -> tuple[Picture, ...]:
-    return tuple(picture for picture in pictures if picture is not None)
+    data = evaluation.summary()
+    data |= {"budget": {"models": [budget.summary() for budget in budgets]}} if budgets else {}
+    data |= {"traversals": both[0].summary()} if both else {}
+    return Page("Evaluation", " ".join([*verdicts, lead]), sections, data=data)
 
 
 def _lead_of_table(evaluation: Evaluation) -> str:
@@ -201,6 +155,17 @@ def _intervals(evaluation: Evaluation) -> Table:
     return Table("With intervals", (*head, "coverage", "out of distribution"), rows, note)
 
 
+def _budgets(budgets: Sequence[Budget]) -> Section:
+    lead = (
+        "On a twin the exact value of every part of the error is known. The mean absolute error [nT] that "
+        "remains when the terms are closed one after the other, from left to right. Closing a term removes "
+        "its part of the error, less what the model learned of it in training."
+    )
+    rows = tuple((budget.name, budget.mae_nt, *budget.left_nt) for budget in budgets)
+    head = ("model", "all", *(f"without {term}" for term in TERMS))
+    return Section("Error budget", lead, (), (Table("Errors that remain", head, rows),))
+
+
 def _models(evaluation: Evaluation) -> Table:
     rows = tuple(
         (
@@ -234,18 +199,12 @@ def _maps(evaluation: Evaluation) -> Table:
     return Table("Maps", (*head, "less its mean [nT]"), tuple(rows), note)
 
 
-def _left_out(evaluation: Evaluation) -> Table:
-    rows = tuple(evaluation.left_out.items())
-    note = "All models are evaluated on the same readings." if rows else "None."
-    return Table("Readings left out", ("reason", "readings"), rows, note)
-
-
-def ink(m: int) -> str:
+def _ink(m: int) -> str:
     """Colour of a model by its index."""
     return INKS[m % len(INKS)]
 
 
-def trained_models(evaluation: Evaluation) -> list[int]:
+def _trained(evaluation: Evaluation) -> list[int]:
     """Indices of at most `MOST_PANELS` models from weights files; if there are none, of all but the naive."""
     own = [i for i, one in enumerate(evaluation.candidates) if "sha256" in one.metadata]
     own = own or list(range(1, len(evaluation.candidates))) or [0]
@@ -253,7 +212,7 @@ def trained_models(evaluation: Evaluation) -> list[int]:
 
 
 def _best(evaluation: Evaluation) -> int:
-    return min(trained_models(evaluation), key=lambda m: evaluation.every.scores[m].mae_nt)
+    return min(_trained(evaluation), key=lambda m: evaluation.every.scores[m].mae_nt)
 
 
 def _rank_correlations(evaluation: Evaluation) -> Picture | None:
@@ -282,7 +241,7 @@ def _rank_correlations(evaluation: Evaluation) -> Picture | None:
 
 def _time_series(evaluation: Evaluation) -> Picture:
     """Figure 5: field as measured, by the map alone and by each model, and the errors with their interval."""
-    one, shown = _middle(evaluation), trained_models(evaluation)
+    one, shown = _middle(evaluation), _trained(evaluation)
     t = one.run["t"] - one.run["t"][0]
     seen = t <= SHOWN_S
     t, kept = t[seen], one.kept[seen]
@@ -296,12 +255,12 @@ def _time_series(evaluation: Evaluation) -> Picture:
         half, error = Z_90 * one.sd_nt[m, seen], total - measured
         draw_line(above, t, measured / 1000, color=INK, lw=1.8, label="measured")
         draw_line(above, t, alone / 1000, color="0.55", lw=1.0, label="map alone")
-        draw_line(above, t, total / 1000, color=ink(m), lw=1.0, label="map and model")
+        draw_line(above, t, total / 1000, color=_ink(m), lw=1.0, label="map and model")
         if np.isfinite(half).any():
-            band = {"color": ink(m), "alpha": 0.18, "lw": 0, "label": f"its {COVERED:.0%} interval"}
+            band = {"color": _ink(m), "alpha": 0.18, "lw": 0, "label": f"its {COVERED:.0%} interval"}
             below.fill_between(t[rows], -half[rows], half[rows], **band)
         draw_line(below, t, alone - measured, color="0.55", lw=0.8)
-        draw_line(below, t, error, color=ink(m))
+        draw_line(below, t, error, color=_ink(m))
         below.axhline(0, color=INK, lw=0.6)
         mae = np.nanmean(np.abs(error)) if np.isfinite(error).any() else np.nan
         title = f"{short_name(evaluation.names[m], 40)}: MAE {mae:.0f} nT"
@@ -371,7 +330,7 @@ def _path_errors(evaluation: Evaluation) -> Picture:
         at = np.arange(len(cases)) + (m - (count - 1) / 2) * width
         mae = np.array([case.scores[m].mae_nt for case in cases])
         low, high = np.array([case.scores[m].mae_interval_nt for case in cases]).T
-        ax.bar(at, mae, 0.92 * width, color=ink(m), label=name)
+        ax.bar(at, mae, 0.92 * width, color=_ink(m), label=name)
         spread = np.nan_to_num(np.stack([mae - low, high - mae]).clip(0))
         ax.errorbar(at, mae, yerr=spread, fmt="none", ecolor=INK, elinewidth=0.8, capsize=1.5)
     ax.set_xticks(np.arange(len(cases)), [case.name for case in cases], fontsize=9)
@@ -381,24 +340,3 @@ def _path_errors(evaluation: Evaluation) -> Picture:
     ax.set_axisbelow(True)
     legend_below(figure)
     return picture(figure, f"Figure 6 a, b: errors by path, with {LEVEL:.0%} intervals", file="figure_6ab")
-
-
-def _learning_curves(
-    evaluation: Evaluation, curves: Mapping[str, Sequence[Mapping[str, float]]]
-) -> Picture | None:
-    """Figure 6 c: learning curves of the models that have one."""
-    shown = {m: curves[name] for m, name in enumerate(evaluation.names) if curves.get(name)}
-    if not shown:
-        return None
-    figure = new_figure(WIDTH_IN, 3.4)
-    ax = figure.subplots()
-    for m, rows in shown.items():
-        for column, (part, style) in CURVES.items():
-            points = [(row[EPOCH], row[column]) for row in rows if column in row]
-            if points:
-                text = f"{evaluation.names[m]}, {part}"
-                ax.plot(*zip(*points, strict=True), ls=style, color=ink(m), label=text)
-    label_epochs(ax)
-    legend_below(figure)
-    title = "Figure 6 c: error in training and on validation recordings over the epochs"
-    return picture(figure, title, file="figure_6c")

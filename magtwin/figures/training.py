@@ -1,17 +1,13 @@
 """Training: learning curves and input correlations, as in Figures 6c and 2 of the paper."""
 
-import os
 from collections.abc import Sequence
-from dataclasses import astuple, fields
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from magtwin.figures.canvas import INK, MAP_INK, OTHER_INK, WIDTH_IN, label, legend_below, new_figure
-from magtwin.files.outputs import output
 from magtwin.learn.data.correlation import PAPER, Correlations
 from magtwin.learn.models.predictor import Epoch
 
@@ -36,36 +32,17 @@ def draw_learning_curve(
         ax.axhline(naive_rmse_nt, color="0.5", ls="--", lw=1, label="validation, naive mean")
     kept = next(epoch for epoch in reversed(history) if epoch.best)
     ax.plot(kept.number, kept.val_rmse_nt, "o", mfc="none", mec=INK, ms=9, label=f"kept: epoch {kept.number}")
-    label_epochs(ax)
+    ax.set_ylim(bottom=0)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    label(ax, "epoch", "RMSE [nT]")
+    ax.grid(color="0.9")
     ax.set_axisbelow(True)
     ax.set_title(title, fontsize=10)
     legend_below(figure)
     return figure
 
 
-def label_epochs(ax: Axes) -> None:
-    """Axes, ticks and grid of errors [nT] over whole epochs."""
-    ax.set_ylim(bottom=0)
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    label(ax, "epoch", "RMSE [nT]")
-    ax.grid(color="0.9")
-
-
-def write_learning_curve(
-    history: Sequence[Epoch], out: str | os.PathLike[str], *, force: bool = False
-) -> None:
-    """Write the epochs as CSV: number, training and validation RMSE, validation MAE [nT], and whether best.
-
-    Raises:
-        InputError: `out` exists.
-    """
-    lines = [",".join(field.name for field in fields(Epoch))]
-    lines += [",".join(repr(int(v) if isinstance(v, bool) else v) for v in astuple(e)) for e in history]
-    with output(out, force=force) as aside:
-        aside.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def draw_correlations(correlations: Correlations, *, title: str = "") -> Figure:
+def draw_correlations(correlations: Correlations) -> Figure:
     """Draw the correlation of each input with the disturbance, beside the paper's values."""
     names, count = correlations.features, len(correlations.features)
     figure = new_figure(WIDTH_IN, 1.5 + 0.24 * count)
@@ -90,6 +67,5 @@ def draw_correlations(correlations: Correlations, *, title: str = "") -> Figure:
     label(ax, "Spearman's correlation with the disturbance")
     ax.grid(axis="x", color="0.9")
     ax.set_axisbelow(True)
-    ax.set_title(title, fontsize=10)
     legend_below(figure)
     return figure

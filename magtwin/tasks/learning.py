@@ -3,10 +3,11 @@
 Training is `magtwin.learn.training.train.train`.
 """
 
+import functools
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -23,7 +24,7 @@ from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import MANIFEST, Dataset, open_dataset
 from magtwin.learn.data.dataset import build_dataset as build
 from magtwin.learn.data.recording import Source, sources_of
-from magtwin.learn.evaluation.budget import Budget, TrueError, Truth, budgets, steps, true_errors
+from magtwin.learn.evaluation.budget import Budget, Truth, budget
 from magtwin.learn.evaluation.candidates import (
     NAIVE,
     Candidate,
@@ -35,17 +36,17 @@ from magtwin.learn.evaluation.candidates import (
     tolles_lawson_variants,
 )
 from magtwin.learn.evaluation.evaluate import evaluate as judge
+from magtwin.learn.evaluation.evaluate import trials_of, unlearned, unseen
 from magtwin.learn.evaluation.evaluation import Evaluation
-from magtwin.learn.evaluation.trials import check_apart, trials_of, unlearned, unseen
 from magtwin.learn.inference.calibrate import calibrate as calibrate_model
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.inference.widen import widened
 from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.predictor import Predictor, load_predictor
-from magtwin.learn.training.model_card import widened_card
+from magtwin.learn.training.result import widened_card
 from magtwin.run.run import Run
 from magtwin.spec.scene import Scene
-from magtwin.twin import Twin, check_scene, in_session_of, open_twin, scene_file
+from magtwin.twin import check_scene, in_session_of, open_twin, scene_file
 from magtwin.usd.scene import read_scene
 
 File = str | os.PathLike[str]
@@ -90,11 +91,7 @@ def build_dataset(
         InputError: A file cannot be read; two recordings have the same name; a recording has no poses, no
             field or no reading inside the map; all labels are equal; or the folder exists.
     """
-    if isinstance(runs, Mapping):
-        sources = sources_of(runs)
-    else:
-        sources = sources_of_files(runs, session_by=session_by, path_by=path_by, **reading)
-    checksum = ""
+    sources, checksum = _sources(runs, session_by=session_by, path_by=path_by, **reading), ""
     if not isinstance(anomaly_map, AnomalyMap):
         from magtwin.usd.layers import layer_sha256
 
@@ -187,7 +184,8 @@ def evaluate(
     if seed < 0:
         raise InputError(f"seed must be a whole number from 0 up, got {seed!r}")
     maps = _named_maps([anomaly_map] if _single(anomaly_map) else anomaly_map)  # type: ignore[arg-type,list-item]
-    given: list[Any] = [models] if _single(models) or _is_model(models) else list(models)  # type: ignore[arg-type]
+    alone = _single(models) or isinstance(models, Candidate | Predictor)
+    given: list[Any] = [models] if alone else list(models)  # type: ignore[arg-type]
     files = iter(short_names([Path(model) for model in given if _single(model)]))
     candidates = []
     for model in given:
@@ -313,9 +311,8 @@ def widen(
     if isinstance(model, str | os.PathLike):
         path = existing(model, "weights file")
         model, card, before = load_predictor(path), path.with_suffix(".md"), sha256(path)
-    sources = sources_of(recordings) if isinstance(recordings, Mapping) else sources_of_files(recordings)
     field = anomaly_map if isinstance(anomaly_map, AnomalyMap) else open_map(anomaly_map)
-    wide = widened(model, sources, field)
+    wide = widened(model, _sources(recordings), field)
     if out is not None:
         with transaction():
             with output(out, force=force) as weights:
@@ -328,39 +325,14 @@ def widen(
     return wide
 
 
-@dataclass(frozen=True)
-class ErrorBudget:
-    """What makes the errors of an evaluation's models; see `magtwin.learn.evaluation.budget`."""
-
-    budgets: tuple[Budget, ...]
-    map_errors: tuple[TrueError, ...]
-
-    order: tuple[int, ...]
-    """Models, step by step from the paper's configuration on."""
-
-    names: tuple[str, ...]
-    """Names of the models."""
-
-    def summary(self) -> dict[str, Any]:
-        """All figures as plain numbers and texts."""
-        return {
-            "models": [budget.summary() for budget in self.budgets],
-            "maps": {
-                error.map: {name: value for name, value in vars(error).items() if name != "map"}
-                for error in self.map_errors
-            },
-            "steps": [self.names[m] for m in self.order],
-        }
-
-
 def error_budget(
     evaluation: Evaluation,
     scene: File,
     train: Dataset | File,
     *,
     progress: Progress = lambda done, total, what: None,
-) -> ErrorBudget:
-    """How much of the errors is map, lever arm, latency, sessions, platform and sensor, on a twin.
+) -> tuple[Budget, ...]:
+    """How much of the error of each model is map, lever arm, latency, sessions, platform and sensor.
 
     Args:
         evaluation: An evaluation on runs of a twin.
@@ -371,22 +343,20 @@ def error_budget(
     Raises:
         InputError: A recording has no truth, or is of another scene.
     """
-    twins: dict[Any, Twin] = {}
-
-    def opened(kind: Any) -> Twin:
-        if kind not in twins:
-            twins[kind] = open_twin(Path(scene), magnetometer=kind)
-        return twins[kind]
+    opened = functools.cache(lambda kind: open_twin(Path(scene), magnetometer=kind))
 
     def scene_in_session(name: str, run: Run) -> Scene:
         of_session = in_session_of(opened(run.metadata.get("magnetometer")), run.metadata).scene
         check_scene(of_session, run.metadata, name)
         return of_session
 
-    truth = Truth(opened("physical").scene, scene_in_session)
-    order = steps(evaluation)
-    made = budgets(evaluation, order, truth, _dataset(train), evaluation.learned or None, progress=progress)
-    return ErrorBudget(tuple(made), tuple(true_errors(evaluation, truth)), tuple(order), evaluation.names)
+    truth, train = Truth(opened("physical").scene, scene_in_session), _dataset(train)
+    made = []
+    for m, name in enumerate(evaluation.names):
+        progress(m, len(evaluation.names), name)
+        made.append(budget(evaluation, m, truth, train, evaluation.learned or None))
+    progress(len(made), len(made), "")
+    return tuple(made)
 
 
 def map_of_scene(scene: File) -> Path:
@@ -410,10 +380,6 @@ def short_names(files: Sequence[Path]) -> list[str]:
 
 def _single(value: Any) -> bool:
     return isinstance(value, str | os.PathLike | AnomalyMap)
-
-
-def _is_model(value: Any) -> bool:
-    return isinstance(value, Candidate) or hasattr(value, "predict")
 
 
 def _dataset(dataset: Dataset | File) -> Dataset:
@@ -447,16 +413,18 @@ def _trials(
     """Recordings to judge by, and the training recordings that baselines are fitted to."""
     learned: Sequence[str] = () if learning is None else learning.names
     is_set = isinstance(recordings, str | os.PathLike) and (Path(recordings) / MANIFEST).is_file()
-    if not (isinstance(recordings, Dataset) or is_set):
-        if isinstance(recordings, Mapping):
-            trials = [Source(name, lambda run=run: run) for name, run in recordings.items()]  # type: ignore[misc]
-        else:
-            trials = sources_of_files(recordings)  # type: ignore[arg-type]
-        return trials if learning is None else unlearned(trials, learning), learned
-    judged = _dataset(recordings)  # type: ignore[arg-type]
-    names, rest = unseen(judged, candidates)
-    if learning is not None:
-        if learning.folder.resolve() == judged.folder.resolve():
+    if isinstance(recordings, Dataset) or is_set:
+        judged = _dataset(recordings)  # type: ignore[arg-type]
+        names, rest = unseen(judged, candidates)
+        if learning is not None and learning.folder.resolve() == judged.folder.resolve():
             learned = tuple(name for name in rest if name not in names)
-        check_apart(learning, learned, judged, names)
-    return trials_of(judged, names), learned
+        trials = trials_of(judged, names)
+    else:
+        trials = _sources(recordings)
+    return trials if learning is None else unlearned(trials, learning, learned), learned
+
+
+def _sources(recordings: Mapping[str, Run] | Sequence[File] | File, **options: Any) -> list[Source]:
+    return (
+        sources_of(recordings) if isinstance(recordings, Mapping) else sources_of_files(recordings, **options)
+    )

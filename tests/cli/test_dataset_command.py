@@ -97,26 +97,6 @@ def test_a_table_of_another_program_is_read_by_its_own_names_of_columns(recorded
     assert np.isfinite(found["label_nt"]).any()
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--column", "t=tim"], "no column 'tim'; did you mean 'time'"),
-        (["--column", "time"], "--column takes NAME=THEIRS, such as yaw=heading, each once, got 'time'"),
-        (
-            ["--column", "t=time", "--column", "yaw=time"],
-            "--column names one column twice, got t=time yaw=time",
-        ),
-    ],
-)
-def test_columns_that_a_table_lacks_or_that_are_named_twice_are_refused(tmp_path, capsys, words, said):
-    (tmp_path / "theirs.csv").write_text("time,B\n0,1\n1,2\n")
-    files = [str(tmp_path / "theirs.csv"), "--map", str(MAP), "--out", str(tmp_path / "set")]
-    with pytest.raises(SystemExit):
-        main(["dataset", "build", *files, *words])
-    assert said in capsys.readouterr().err
-    assert not (tmp_path / "set").exists()
-
-
 def test_a_folder_of_runs_stands_for_its_runs_and_their_sessions(recorded, tmp_path, capsys):
     (tmp_path / "runs").mkdir()
     run = read_run(recorded / "c.parquet")
@@ -143,17 +123,6 @@ def test_info_tells_of_every_recording_and_reads_every_shard(made, capsys):
     assert told["figures"]["labels"]["value"] == 320
 
 
-def test_correlate_tells_and_draws(made, tmp_path, capsys):
-    main(["dataset", "correlate", str(made), "--out", str(tmp_path / "f.png"), "--json"])
-    told = json.loads(capsys.readouterr().out)
-    assert len(told["figures"]) == 20
-    assert told["figures"]["odom_v_x"]["value"] == "never varies"
-    assert told["metadata"]["groups"] == 4
-    assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
-    main(["dataset", "correlate", str(made), "--features", "lidar_on, imu_w_x", "--json"])
-    assert list(json.loads(capsys.readouterr().out)["figures"]) == ["lidar_on", "imu_w_x"]
-
-
 @pytest.mark.parametrize(
     ("options", "text"),
     [
@@ -167,11 +136,6 @@ def test_correlate_tells_and_draws(made, tmp_path, capsys):
             ["build", "DAYS/c.parquet", "--alignment", "fit"],
             "80 readings have a label on the map 'lab', too few",
         ),
-        (
-            ["correlate", "SET", "--features", "gradiant"],
-            "no feature set 'gradiant'; did you mean 'gradient'?",
-        ),
-        (["correlate", "SET", "--features", "vector"], "which not all of its recordings have"),
         (["info", "DAYS"], "no such manifest of a data set"),
     ],
 )

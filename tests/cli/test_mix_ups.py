@@ -147,7 +147,6 @@ SLOTS = {
     "compensate fit FILE --out new.json": RUNS,
     "compensate apply run.parquet FILE --out new.parquet": {"model.json"},
     "dataset info FILE": {"set"},
-    "dataset correlate FILE": {"set"},
     "train FILE --out new.safetensors": {"set"},
     "train set --config FILE --out new.safetensors": {"training.toml"},
     "network export FILE --out new.onnx": {"net.safetensors", "net.pth"},

@@ -74,7 +74,8 @@ def _dataset(folder: Path) -> None:
 
 
 def _network(folder: Path) -> None:
-    words = ("--layers", "8,8", "--epochs", 1, "--batch", 64)
+    (folder / "train.toml").write_text("layers = [8, 8]\nepochs = 2\nbatch = 64\n", encoding="utf-8")
+    words = ("--config", folder / "train.toml", "--epochs", 1)
     _magtwin("train", folder / "set", "--out", folder / "net.safetensors", *words)
 
 
@@ -171,9 +172,8 @@ COMMANDS = (
     ),
     Command(
         "train",
-        "train IN/set --out net.safetensors --layers 8,8 --epochs 2 --batch 64 --rrd net.rrd",
-        ("dataset",),
-        keeps=True,
+        "train IN/set --out net.safetensors --config IN/train.toml",
+        ("dataset", "network"),
     ),
     Command("train linear", "train IN/set --out net.safetensors --model linear", ("dataset",)),
     Command("network export", "network export IN/net.safetensors --out net.onnx", ("network",)),

@@ -24,7 +24,6 @@ def fit(
     no_band: Flag = False,
     penalty: float | None = None,
     preset: Literal["magtwin", "magnav"] = "magtwin",
-    truth: Flag = False,
     force: Force = False,
 ) -> Done:
     """Fit the model to a calibration run that turns through all headings in a uniform or well mapped field.
@@ -49,9 +48,6 @@ def fit(
         Penalty of the regression. Default: by cross-validation, or 0 with --preset magnav.
     preset
         Conventions of the regressors, the filter and the penalty: magtwin's own, or those of MagNav.jl.
-    truth
-        Use the exact field of a simulated run, b_vector_nt, instead of the reading of the vector axes,
-        b_vector_measured_nt, to see the cost of their errors.
     """
     from magtwin.files.outputs import output
     from magtwin.io.tables import read_parquet
@@ -62,7 +58,6 @@ def fit(
     step("Fitting the model")
     model = fit_run(
         read_parquet(expected(run, "run")),
-        vector="exact" if truth else "measured",
         terms=names,
         band_hz=None if no_band else band_hz,
         ridge=penalty,

@@ -115,33 +115,3 @@ def info(dataset: Path) -> Done:
         for each in opened.recordings
     }
     return Done(replace(report, metadata={**report.metadata, "recordings": recordings}))
-
-
-@dataset_app.command
-def correlate(
-    dataset: Path, *, features: str = "full", out: Path | None = None, force: Force = False
-) -> Done:
-    """Correlate each input with the disturbance: Spearman's rank correlation, as in the paper's Figure 2.
-
-    Parameters
-    ----------
-    dataset
-        Folder that `magtwin dataset build` made.
-    features
-        Set of inputs, or names separated by commas.
-    out
-        Picture to write, .png or .svg.
-    """
-    from magtwin.files.outputs import check_free
-    from magtwin.learn.data.correlation import correlations_of
-
-    if out is not None:
-        check_free(out, force=force)
-    step("Ranking the inputs")
-    result = correlations_of(dataset, features)
-    if out is not None:
-        from magtwin.figures.canvas import save
-        from magtwin.figures.training import draw_correlations
-
-        save(draw_correlations(result, title=f"{dataset}"), out, force=force)
-    return Done(result.report(f"Correlation with the disturbance in {dataset}"), out or ())

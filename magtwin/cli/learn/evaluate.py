@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -12,8 +12,8 @@ from magtwin.cli.terminal import Done, progress, stdout_console, step
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
-    from magtwin.figures.page import Section
     from magtwin.learn.evaluation.evaluation import Evaluation
+    from magtwin.run.compare import Traversals
 
 Files = Annotated[list[Path] | None, Parameter(consume_multiple=True)]
 
@@ -32,7 +32,6 @@ def evaluate(
     case: Names = None,
     scene: Path | None = None,
     overlay: Path | None = None,
-    engine: Literal["kinematic", "newton"] | None = None,
     any_map: Flag = False,
     truth: Flag = False,
     seed: Seed = 0,
@@ -67,9 +66,6 @@ def evaluate(
         lever arm, latency, sessions, platform and sensor. Needs train.
     overlay
         Another recording of a path, to compare with the one that is judged by: the paper's Figure 8.
-    engine
-        Drive the first recording's path again in the scene, with this engine and another seed, and compare
-        the two: the paper's Figure 8.
     any_map
         Use the first map for weights whose own map is not at hand.
     truth
@@ -79,23 +75,20 @@ def evaluate(
     """
     from json import loads
 
-    from magtwin.figures.budgets import section_of_budget
-    from magtwin.figures.evaluations import page_of_evaluation, read_curve, write_evaluation
-    from magtwin.figures.page import to_json
+    from magtwin.figures.evaluations import NAME, page_of_evaluation
+    from magtwin.figures.page import to_json, write_pages
     from magtwin.files.outputs import check_free
     from magtwin.learn.evaluation.evaluation import TOTALS
-    from magtwin.tasks.learning import error_budget, map_of_scene, short_names
+    from magtwin.tasks.learning import error_budget, map_of_scene
     from magtwin.tasks.learning import evaluate as evaluate_models
 
     check_free(out, force=force)
-    if scene is not None and map and train is None and engine is None:
+    if scene is not None and map and train is None:
         raise InputError(
             "--scene adds an error budget, for which --train is needed too; give it, or no --scene"
         )
     if (runs is None) == (dataset is None):
         raise InputError("judge by --runs or by a --dataset, one of the two")
-    if overlay is not None and engine is not None:
-        raise InputError("--overlay and --engine both name a drive to compare with; give one of them")
     cases = pairs("case", case, "a row of the table and its path, such as D=lawnmower.csv")
     if taken := cases.keys() & set(TOTALS):
         raise InputError(f"--case {min(taken)} is a row of the table already; take another name")
@@ -112,46 +105,27 @@ def evaluate(
             seed=seed,
             progress=advance,
         )
-    sections, data = [], {}
+    budgets: tuple[Any, ...] = ()
     if scene is not None and train is not None:
         with progress("Error budgets", "models") as advance:
-            budget = error_budget(evaluation, scene, train, progress=advance)
-        sections.append(section_of_budget(evaluation, budget.budgets, budget.map_errors, budget.order))
-        data["budget"] = budget.summary()
-    if overlay is not None or engine is not None:
-        section, data["traversals"] = _traversals(evaluation, scene, overlay, engine)
-        sections.append(section)
+            budgets = error_budget(evaluation, scene, train, progress=advance)
+    both = None if overlay is None else _overlaid(evaluation, overlay)
     step("Writing the report")
-    curves = {name: read_curve(path) for path, name in zip(weights, short_names(weights), strict=True)}
-    page = page_of_evaluation(evaluation, curves=curves, more=sections, data=data)
-    write_evaluation(page, out, force=force)
+    page = page_of_evaluation(evaluation, budgets=budgets, both=both)
+    write_pages(page, out, NAME, force=force)
     written = f"Wrote {out}: evaluation.html, evaluation.md, evaluation.json"
     return Done(table=lambda: _print(evaluation), text=written, data=loads(to_json(page)))
 
 
-def _traversals(
-    evaluation: "Evaluation", scene: Path | None, overlay: Path | None, engine: str | None
-) -> "tuple[Section, dict[str, Any]]":
-    """One path driven twice, as a section and as figures."""
-    from magtwin.figures.reports import section_of_traversals
+def _overlaid(evaluation: "Evaluation", overlay: Path) -> "tuple[Traversals, tuple[str, str]]":
+    """The judged recording of an overlay's path, else the first, over the overlay, and their names."""
     from magtwin.io.formats import read_run
-    from magtwin.io.provenance import made_again
     from magtwin.run.compare import traversals
 
-    first = evaluation.judged[0]
-    if overlay is not None:
-        other, name = read_run(overlay), overlay.stem
-        path = str(other.metadata.get("path", ""))
-        same = [each for each in evaluation.judged if each.path == path and each.name != name]
-        first = same[0] if same else first
-    else:
-        seed = first.run.metadata.get("seed")
-        seed = seed + 1 if isinstance(seed, int) and seed >= 0 else 1
-        with progress(f"Driving {first.path}", "steps") as advance:
-            other = made_again(first.run, scene, engine=engine, seed=seed, progress=advance)
-        name = f"{first.path} by {engine}"
-    both = traversals(first.run, other)
-    return section_of_traversals(both, (first.name, name)), both.summary()
+    other, name = read_run(overlay), overlay.stem
+    same = [each for each in evaluation.judged if each.path == str(other.metadata.get("path", ""))]
+    first = next((each for each in same if each.name != name), evaluation.judged[0])
+    return traversals(first.run, other), (first.name, name)
 
 
 def _print(evaluation: "Evaluation") -> None:

@@ -3,7 +3,7 @@
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -41,51 +41,19 @@ DEFAULT_TERMS = ("permanent", "induced6", "eddy9")
 DEFAULT_BAND_HZ = (0.1, 0.9)
 """Band of an aircraft's manoeuvres [Hz]; the Earth's field and the map vary more slowly."""
 
-Vector = Literal["measured", "exact"]
-VECTORS: Mapping[str, str] = MappingProxyType({"measured": "b_vector_measured_nt", "exact": "b_vector_nt"})
-"""Columns of a run for the direction cosines: the reading of the vector axes, or the exact field of a
-simulated run."""
-
 Preset = Literal["magtwin", "magnav"]
+PRESETS = ("magtwin", "magnav")
+"""Conventions of regressors, filter and fit. "magnav" follows `create_TL_A` and `create_TL_coef` of MagNav.jl
+(Gnadt et al. 2022)."""
 
+MAGNAV_SCALE_NT = 50_000.0
+"""Field that MagNav.jl divides induced and eddy terms by [nT]."""
 
-@dataclass(frozen=True)
-class Convention:
-    """How regressors are made, filtered and fitted."""
+MAGNAV_PADDING, MAGNAV_TRIM = 24, 20
+"""Samples by which it extends signals at each end of the filter, and filtered samples that it discards."""
 
-    scale_nt: float = 1.0
-    """Induced and eddy terms are divided by this field [nT]."""
-
-    field_rate: bool = False
-    """Eddy terms are u_i dB_j/dt, instead of |B| u_i du_j/dt."""
-
-    per_sample: bool = False
-    """Derivatives are per sample, instead of per second."""
-
-    dropped: int = 1
-    """Axis of the term that induced5 and eddy8 drop; 1 is y."""
-
-    padding: int | None = None
-    """Samples of odd extension at each end of the filter. Default: that of `scipy.signal.sosfiltfilt`."""
-
-    trim: int = 0
-    """Filtered samples to discard at each end; their values depend on the padding."""
-
-    absolute_ridge: bool = False
-    """The penalty r is that of |F(b - A c)|^2 + r |c|^2, 0 by default, instead of relative to the columns'
-    mean squares and by cross-validation. A fit of all frequencies is not centred."""
-
-    centred: bool = True
-    """The interference is minus its mean, unless the terms have a bias."""
-
-
-PRESETS: Mapping[str, Convention] = MappingProxyType(
-    {
-        "magtwin": Convention(),
-        "magnav": Convention(50_000.0, True, True, 2, 24, 20, True, False),
-    }
-)
-"""Named conventions. "magnav" follows `create_TL_A` and `create_TL_coef` of MagNav.jl (Gnadt et al. 2022)."""
+VECTOR = "b_vector_measured_nt"
+"""Column of a run for the direction cosines: the reading of the vector axes."""
 
 RIDGES = np.logspace(-12, 3, 31)
 """Ridge penalties of the cross-validation, relative to the mean square of the standardised columns."""
@@ -118,11 +86,9 @@ def design_matrix(
         the bias, without unit for induced terms, and in s for eddy terms; with "magnav" all are in nT.
 
     Raises:
-        InputError: A term is unknown or given twice, the field is not (N, 3), is zero or not finite, or there
-            are fewer than three readings.
+        InputError: A term is unknown or given twice, or the field is not (N, 3), zero, or not finite.
     """
-    by = find("preset", preset, PRESETS)
-    b = np.asarray(b_vector_nt, float)
+    magnav, b = _is_magnav(preset), np.asarray(b_vector_nt, float)
     if b.ndim != 2 or b.shape[1] != 3 or len(b) < 3:
         raise InputError(f"b_vector_nt must have shape (N, 3) with N at least 3, got {b.shape}")
     if not 0 < rate_hz < np.inf:
@@ -137,9 +103,10 @@ def design_matrix(
             f"terms must name at least one kind, and each once, got {', '.join(terms) or 'none'}"
         )
     u = b / size[:, None]
-    rate = np.gradient(b if by.field_rate else u, 1.0 if by.per_sample else 1 / rate_hz, axis=0)
-    induced, eddy = size / by.scale_nt, (np.ones_like(size) if by.field_rate else size) / by.scale_nt
-    dropped = (by.dropped, by.dropped)
+    rate = np.gradient(b, axis=0) if magnav else np.gradient(u, 1 / rate_hz, axis=0)
+    induced, eddy, dropped = size, size, (1, 1)
+    if magnav:
+        induced, eddy, dropped = size / MAGNAV_SCALE_NT, np.ones_like(size) / MAGNAV_SCALE_NT, (2, 2)
     columns: list[Array] = []
     names: list[str] = []
     for term in terms:
@@ -181,28 +148,18 @@ class TollesLawson:
     residual_sd_nt: float
     """Standard deviation of the residual, in its band [nT]."""
 
-    vector: Vector = "measured"
-    """Field of a run that it is fitted to and compensates by, a name of `VECTORS`."""
-
     preset: Preset = "magtwin"
     """Conventions of the regressors and the fit, a name of `PRESETS`."""
 
     def interference_nt(self, b_vector_nt: ArrayLike, rate_hz: float) -> Array:
-        """Part of the magnitude from the platform, minus its mean unless the terms have a bias.
+        """Part of the magnitude from the platform [nT], shape (N,); arguments as for `design_matrix`.
 
-        The preset "magnav" does not subtract the mean.
-
-        Args:
-            b_vector_nt: Field of the vector magnetometer in the platform's axes [nT], shape (N, 3).
-            rate_hz: Readings a second [Hz].
-
-        Returns:
-            Interference [nT], shape (N,).
+        It is minus its mean, unless the terms have a bias or the preset is "magnav".
         """
         matrix, _ = design_matrix(b_vector_nt, rate_hz, self.terms, preset=self.preset)
         modelled = matrix @ np.asarray(self.coefficients)
-        centred = PRESETS[self.preset].centred and "bias" not in self.terms
-        return modelled - modelled.mean() if centred else modelled
+        kept = self.preset == "magnav" or "bias" in self.terms
+        return modelled if kept else modelled - modelled.mean()
 
     def compensate(self, b_nt: ArrayLike, b_vector_nt: ArrayLike, rate_hz: float) -> Array:
         """Scalar readings without the platform's part [nT], shape (N,)."""
@@ -229,11 +186,11 @@ class TollesLawson:
                 None if data["band_hz"] is None else (float(data["band_hz"][0]), float(data["band_hz"][1])),
                 float(data["ridge"]),
                 float(data["residual_sd_nt"]),
-                data.get("vector", "measured"),
                 data.get("preset", "magtwin"),
             )
-            find("vector of a Tolles-Lawson model", str(model.vector), VECTORS)
-            find("preset", str(model.preset), PRESETS)
+            _is_magnav(str(model.preset))
+            if data.get("vector", "measured") != "measured":
+                raise ValueError(f"fitted to {data['vector']} vectors; fit it again")
         except (ValueError, KeyError, TypeError, IndexError, OSError, RecursionError) as error:
             raise InputError(
                 f"{file}: not a Tolles-Lawson model as `magtwin compensate fit` writes it "
@@ -257,7 +214,7 @@ class TollesLawson:
                 Figure("ridge", self.ridge),
                 Figure("residual", self.residual_sd_nt, "nT", note=f"standard deviation, {band}"),
             ),
-            {"terms": list(self.terms), "vector": VECTORS[self.vector], "preset": self.preset},
+            {"terms": list(self.terms), "vector": VECTOR, "preset": self.preset},
         )
 
 
@@ -291,11 +248,9 @@ def fit_tolles_lawson(
         preset: A name of `PRESETS`.
 
     Raises:
-        InputError: Shapes do not fit, the preset is unknown, a value is not finite, the band does not fit the
-            rate, a bias is asked for in a band without "magnav", or there are fewer readings than
-            coefficients.
+        InputError: Arguments do not fit each other, a value is not finite, or readings are too few.
     """
-    b, by = np.asarray(b_nt, float), find("preset", preset, PRESETS)
+    b, magnav = np.asarray(b_nt, float), _is_magnav(preset)
     matrix, names = design_matrix(b_vector_nt, rate_hz, terms, preset=preset)
     if b.shape != (len(matrix),):
         raise InputError(f"b_nt must have shape ({len(matrix)},), as b_vector_nt has rows, got {b.shape}")
@@ -306,7 +261,7 @@ def fit_tolles_lawson(
         raise InputError(f"{len(b)} readings are too few for {len(names)} coefficients")
     if ridge is not None and not 0 <= ridge < np.inf:
         raise InputError(f"ridge must not be below 0, and finite, got {ridge!r}")
-    if band_hz is not None and "bias" in terms and by.centred:
+    if band_hz is not None and "bias" in terms and not magnav:
         raise InputError(
             "a pass band excludes a bias, so it cannot be fitted; leave the bias out, or fit all "
             "frequencies (band_hz=None, --no-band)"
@@ -315,9 +270,9 @@ def fit_tolles_lawson(
         matrix, b = (band_pass(v, band_hz, rate_hz, preset=preset) for v in (matrix, b))
         if len(b) <= len(names):
             raise InputError(f"{len(b)} trimmed readings are too few for {len(names)} coefficients")
-    elif "bias" not in terms and by.centred:
+    elif "bias" not in terms and not magnav:
         matrix, b = matrix - matrix.mean(axis=0), b - b.mean()
-    if by.absolute_ridge:
+    if magnav:
         penalty = 0.0 if ridge is None else float(ridge)
         rows = np.vstack([matrix, np.sqrt(penalty) * np.eye(len(names))])
         c = np.linalg.lstsq(rows, np.concatenate([b, np.zeros(len(names))]), rcond=None)[0]
@@ -331,33 +286,27 @@ def fit_tolles_lawson(
     return TollesLawson(tuple(terms), tuple(c.tolist()), band_hz, chosen, float(np.std(b - matrix @ c)))
 
 
-def fit_run(run: Run, *, vector: Vector = "measured", **options: Any) -> TollesLawson:
+def fit_run(run: Run, **options: Any) -> TollesLawson:
     """`fit_tolles_lawson` on a run: b_measured_nt minus b_map_nt, against its field vectors.
 
     The longest unbroken stretch of rows with a map, a reading and a vector is used, because the filter needs
-    one.
-
-    Args:
-        run: A calibration run.
-        vector: "measured" uses the reading of the vector axes, b_vector_measured_nt, with their errors;
-            "exact" the b_vector_nt of a simulated run, for comparison.
-        options: Options of `fit_tolles_lawson`.
+    one. `options` are those of `fit_tolles_lawson`.
 
     Raises:
         InputError: The run has no such vectors, or too few in a row.
     """
-    b_vector, rows, rate = unbroken(run, vector)
+    b_vector, rows, rate = _unbroken(run)
     b = run["b_measured_nt"][rows] - run["b_map_nt"][rows]
-    return replace(fit_tolles_lawson(b, b_vector[rows], rate, **options), vector=vector)
+    return fit_tolles_lawson(b, b_vector[rows], rate, **options)
 
 
 def compensate_run(run: Run, model: TollesLawson) -> tuple[Run, Report]:
     """Remove the part of b_measured_nt that a model explains.
 
     Returns:
-        The run, with nan in b_measured_nt where it has no vector of the model's kind, and a report.
+        The run, with nan in b_measured_nt where it has no vector, and a report.
     """
-    b_vector, rows, rate = unbroken(run, model.vector)
+    b_vector, rows, rate = _unbroken(run)
     interference = np.full(run.rows, np.nan)
     interference[rows] = model.interference_nt(b_vector[rows], rate)
     before = (run["b_measured_nt"] - run["b_map_nt"])[rows]
@@ -373,7 +322,7 @@ def compensate_run(run: Run, model: TollesLawson) -> tuple[Run, Report]:
         Figure("variance removed", removed, "", note="share, 1 is all of it" if removed >= 0 else worse),
     )
     compensated = run.with_columns(b_measured_nt=run["b_measured_nt"] - interference)
-    about = {"terms": list(model.terms), "vector": VECTORS[model.vector]}
+    about = {"terms": list(model.terms), "vector": VECTOR}
     line = verdict(
         float(after.std()),
         float(before.std()),
@@ -404,7 +353,7 @@ def band_pass(
     """
     from scipy.signal import butter, sosfiltfilt  # slow import
 
-    by, values = find("preset", preset, PRESETS), np.asarray(values, float)
+    magnav, values = _is_magnav(preset), np.asarray(values, float)
     low, high = band_hz
     if not 0 < low < high < rate_hz / 2:
         raise InputError(
@@ -417,14 +366,14 @@ def band_pass(
             f"{low:g}"
         )
     stages = butter(4, band_hz, btype="bandpass", fs=rate_hz, output="sos")
-    padding = 3 * (2 * len(stages) + 1) if by.padding is None else by.padding
-    least = max(padding, 2 * by.trim)
+    padding, trim = (MAGNAV_PADDING, MAGNAV_TRIM) if magnav else (3 * (2 * len(stages) + 1), 0)
+    least = max(padding, 2 * trim)
     if len(values) <= least:
         raise InputError(f"{len(values)} readings are too few for the band-pass, {least + 1} are needed")
     filtered = np.asarray(sosfiltfilt(stages, values, axis=0, padlen=padding))
-    if not by.centred:
+    if magnav:
         filtered = np.where(values.std(axis=0) <= np.finfo(float).eps, values, filtered)
-    return filtered[by.trim : len(filtered) - by.trim]
+    return filtered[trim : len(filtered) - trim]
 
 
 def _ridge(gram: Array, along: Array, penalty: float) -> Array:
@@ -451,24 +400,22 @@ def _cross_validated(matrix: Array, b: Array) -> float:
     return float(RIDGES[np.argmin(errors)])
 
 
-def unbroken(run: Run, vector: str) -> tuple[Array, slice, float]:
-    """Field vectors (N, 3) of a run, the longest stretch of rows with a map, a reading and a vector, and the
-    rate [Hz].
+def _is_magnav(preset: str) -> bool:
+    return find("preset", preset, dict.fromkeys(PRESETS, preset)) == "magnav"
+
+
+def _unbroken(run: Run) -> tuple[Array, slice, float]:
+    """Field vectors (N, 3) of a run, the longest stretch of rows with map, reading and vector, the rate [Hz].
 
     Raises:
         InputError: The run has no such vectors, too few in a row, or uneven times.
     """
-    name = find("vector", vector, VECTORS)
-    b_vector = run[name] if name in run else np.full((run.rows, 3), np.nan)
+    b_vector = run[VECTOR] if VECTOR in run else np.full((run.rows, 3), np.nan)
     if not np.isfinite(b_vector).any():
-        other = next(each for each in VECTORS if each != vector)
-        has_other = VECTORS[other] in run and np.isfinite(run[VECTORS[other]]).any()
-        advice = (
-            f'ask for the {other} ones of {VECTORS[other]} (vector="{other}")'
-            if has_other
-            else "record a vector magnetometer, or simulate a scene whose Earth field is known"
+        raise InputError(
+            f"the run has no field vectors in {VECTOR}, which direction cosines need; record a vector "
+            "magnetometer, or simulate a scene whose Earth field is known"
         )
-        raise InputError(f"the run has no field vectors in {name}, which direction cosines need; {advice}")
     fine = np.isfinite(run["b_measured_nt"] - run["b_map_nt"]) & np.isfinite(b_vector).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], fine.astype(np.int8), [0]])))
     starts, stops = edges[::2], edges[1::2]

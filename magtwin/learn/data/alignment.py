@@ -1,18 +1,17 @@
 """Alignment: the place and time of a reading relative to the pose with its stamp, and its fit to a map."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import into_base, wrap_angle, yaw_from_quat
-from magtwin.report.report import Figure, Report
-from magtwin.report.summary import Summarized, Summary
+from magtwin.report.report import Figure
+from magtwin.report.summary import Summarized
 from magtwin.run.run import Run
 from magtwin.run.thinning import newest
 
@@ -21,12 +20,10 @@ Array = NDArray[np.float64]
 UNUSABLE = ("flag_lost_lock", "flag_pose_lost")  # Flags of a run whose readings have no label
 BLOCK_S = 5.0  # Length of blocks of readings with correlated errors [s]
 TILES = 4  # Number of tiles along each side of the driven area; errors of the map and platform stay in place
-DEGREE = 1  # Degree of the fields of the platform that vary over the driven area
 LATENCIES_S = np.arange(-0.4, 0.41, 0.02)  # Latencies that are tried before the best are refined [s]
 END_S = 0.5  # Time at each end of a run that a latency is not fitted to [s]; no pose may lie beyond
 LEAST_ROWS = 200  # Least number of labelled readings for a fit
-LEVER_ARM_PRIOR_M = 0.05  # Prior standard deviation of each axis of the lever arm [m]
-LATENCY_PRIOR_S = 0.1  # Prior standard deviation of the latency [s]
+PRIOR = np.array([0.05, 0.05, 0.1]) ** 2  # Prior variances of the lever arm [m^2] and the latency [s^2]
 FIT_RATE_HZ = 20.0  # Highest rate of readings in the fit [Hz]
 
 SLOPE_S = 0.2
@@ -40,7 +37,7 @@ LIMITS = (
 )
 """Largest size of each figure of an alignment, with its unit."""
 
-STARTS = 3  # Number of best latencies that are refined
+STARTS, ROUNDS = 3, 20  # Number of best latencies that are refined, and most linearisations of each
 
 
 @dataclass(frozen=True, repr=False)
@@ -64,22 +61,13 @@ class Alignment(Summarized):
             if not np.all(np.abs(getattr(self, name)) <= most):
                 raise InputError(f"{name} must be within {most:g} {unit} of 0, got {getattr(self, name)}")
 
-    def report(self, title: str = "Alignment") -> Report:
-        """Lever arm and latency, with their standard deviations."""
-        arm = [
-            Figure(f"lever arm, {way}", value, "m", sd)
-            for way, value, sd in zip(("forward", "left"), self.lever_arm_m, self.lever_arm_sd_m, strict=True)
-        ]
-        return Report(title, (*arm, Figure("latency", self.latency_s, "s", self.latency_sd_s)))
-
-    def _summary(self) -> Summary:
-        (x, y), (sx, sy) = self.lever_arm_m, self.lever_arm_sd_m
-        return Summary(
-            "Alignment",
-            (
-                ("lever arm", f"{x:.4g} +- {sx:.2g} m forward, {y:.4g} +- {sy:.2g} m left"),
-                ("latency", f"{self.latency_s:.4g} +- {self.latency_sd_s:.2g} s"),
-            ),
+    def figures(self) -> tuple[Figure, ...]:
+        """Lever arm and latency, with their standard deviations, for a report."""
+        (forward, left), (forward_sd, left_sd) = self.lever_arm_m, self.lever_arm_sd_m
+        return (
+            Figure("lever arm, forward", forward, "m", forward_sd),
+            Figure("lever arm, left", left, "m", left_sd),
+            Figure("latency", self.latency_s, "s", self.latency_sd_s),
         )
 
 
@@ -145,12 +133,6 @@ def slopes(gradient: Array, yaw: Array, rates: Array) -> Array:
 def fit_alignment(
     runs: Sequence[Run],
     field: AnomalyMap,
-    *,
-    lever_arm: bool = True,
-    latency: bool = True,
-    rounds: int = 20,
-    prior_sd: tuple[float, float] = (LEVER_ARM_PRIOR_M, LATENCY_PRIOR_S),
-    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
 ) -> Alignment:
     """Lever arm and latency with which readings agree best with a map.
 
@@ -163,8 +145,8 @@ def fit_alignment(
     returned. The platform terms are fixed to the robot and depend on its heading: iron, turning, speed, their
     rates, LiDAR and battery current. Without them iron would pass for a lever arm, and the motors' torque
     before a turn for a latency. A robot whose iron has changed since the survey also adds a field that varies
-    with the direction of the lab's field, so polynomials of the place, of degree `DEGREE`, times constant,
-    sine and cosine of the heading are fitted too. On a straight line at one speed a forward lever arm and a
+    with the direction of the lab's field, so both coordinates of the place, times constant, sine and cosine
+    of the heading, are fitted too. On a straight line at one speed a forward lever arm and a
     latency are the same, so both have a weak prior of covariance P around 0. The estimate is G times that of
     least squares, G = P (P + V)^-1, with V from blocks of `BLOCK_S` with correlated errors.
 
@@ -179,19 +161,10 @@ def fit_alignment(
     Args:
         runs: Runs of one robot that turns and drives at several speeds, as for `magtwin.learn.data.labels`.
         field: The map.
-        lever_arm: Fit the lever arm; otherwise it is 0.
-        latency: Fit the latency; otherwise it is 0.
-        rounds: Most linearisations of each start.
-        prior_sd: Prior standard deviations of a lever arm [m] and of a latency [s].
-        progress: Called as progress(done, total, what), once per linearisation.
 
     Raises:
-        InputError: Fewer than `LEAST_ROWS` readings have a label, or nothing is to be fitted.
+        InputError: Fewer than `LEAST_ROWS` readings have a label.
     """
-    if not (lever_arm or latency):
-        raise InputError("neither the lever arm nor the latency is to be fitted; name one")
-    if not all(0 < sd < np.inf for sd in prior_sd):
-        raise InputError(f"prior_sd must be above 0 and finite, got {prior_sd}")
     known = 0
     for run in runs:
         p, yaw, _ = placed(run, Alignment())
@@ -201,30 +174,13 @@ def fit_alignment(
             f"{known} readings have a label on the map {field.name!r}, too few to fit lever arm and latency: "
             f"it takes {LEAST_ROWS}; do the runs lie on the map?"
         )
-    free = np.array([lever_arm, lever_arm, latency])
-    prior = np.array([prior_sd[0], prior_sd[0], prior_sd[1]])[free] ** 2
-    fit = _Fit(runs, field, free, prior)
-    starts = [np.zeros(3)]
-    if latency:
-        tried = np.zeros((len(LATENCIES_S), 3))
-        tried[:, 2] = LATENCIES_S
-        residuals = []
-        for k, place in enumerate(tried):
-            progress(k, len(tried) + STARTS * rounds, "latencies")
-            residuals.append(fit.at(place).promised)
-        starts = [tried[i] for i in np.argsort(residuals)[:STARTS]]
+    fit = _Fit(runs, field)
+    tried = np.zeros((len(LATENCIES_S), 3))
+    tried[:, 2] = LATENCIES_S
+    starts = [tried[i] for i in np.argsort([fit.at(place).promised for place in tried])[:STARTS]]
     fit.alike = fit.at(starts[0]).alike
-    before, most = (len(LATENCIES_S) if latency else 0), len(starts) * rounds
-
-    def descended(k: int, start: Array) -> _Linearised:
-        done = before + k * rounds
-        return _descend(fit, start, rounds, lambda j: progress(done + j, before + most, "rounds"))
-
-    best = min((descended(k, start) for k, start in enumerate(starts)), key=lambda result: result.cost)
-    covariance = fit.at(best.place, robust=True).covariance
-    progress(before + most, before + most, "rounds")
-    sd = np.zeros(3)
-    sd[free] = np.sqrt(np.diag(covariance))
+    best = min((_descend(fit, start) for start in starts), key=lambda result: result.cost)
+    sd = np.sqrt(np.diag(fit.at(best.place, robust=True).covariance))
     forward, left, late = best.place.tolist()
     return Alignment((forward, left), late, (float(sd[0]), float(sd[1])), float(sd[2]))
 
@@ -237,7 +193,7 @@ class _Linearised:
     wanted: Array
     """Solution of least squares and prior, shape (3,)."""
     covariance: Array
-    """Posterior covariance of the free parameters."""
+    """Posterior covariance, shape (3, 3)."""
     cost: float
     """Twice the negative logarithm of the posterior of the place, up to a constant."""
     promised: float
@@ -246,14 +202,13 @@ class _Linearised:
     """Number of readings that err as one."""
 
 
-def _descend(fit: "_Fit", start: Array, rounds: int, report: Callable[[int], Any]) -> _Linearised:
+def _descend(fit: "_Fit", start: Array) -> _Linearised:
     """Iterate from a start; a step that raises the cost is halved."""
     here = fit.at(start)
-    for k in range(rounds):
-        report(k)
+    for _ in range(ROUNDS):
         step = here.wanted - here.place
         sd = np.sqrt(np.diag(here.covariance))
-        if np.all(np.abs(step[fit.free]) < 1e-3 * sd):
+        if np.all(np.abs(step) < 1e-3 * sd):
             break
         for share in (1.0, 0.5, 0.25, 0.125):
             there = fit.at(here.place + share * step)
@@ -268,8 +223,8 @@ def _descend(fit: "_Fit", start: Array, rounds: int, report: Callable[[int], Any
 class _Fit:
     """Thinned readings and a map."""
 
-    def __init__(self, runs: Sequence[Run], field: AnomalyMap, free: NDArray[np.bool_], prior: Array) -> None:
-        self.field, self.free, self.prior = field, free, prior
+    def __init__(self, runs: Sequence[Run], field: AnomalyMap) -> None:
+        self.field = field
         self.alike, self.readings = 1.0, 0
         self.runs = []
         self.corners = np.full((2, 2), np.nan)
@@ -282,9 +237,9 @@ class _Fit:
             step = float(np.median(np.diff(run["t"]))) if run.rows > 1 else 1.0
             every = max(1, round(1 / (step * FIT_RATE_HZ)))
             rows = newest(np.arange(0, run.rows, every), usable(run) & np.isfinite(run["b_measured_nt"]))
-            if free[2]:  # the same readings whatever the latency; else the cost favours those with fewer
-                t = run["t"]
-                rows = rows[(t[rows] >= t[0] + END_S) & (t[rows] <= t[-1] - END_S)]
+            # the same readings whatever the latency; else the cost favours those with fewer
+            t = run["t"]
+            rows = rows[(t[rows] >= t[0] + END_S) & (t[rows] <= t[-1] - END_S)]
             self.runs.append((run, rows, usable(run)))
 
     def at(self, place: Array, robust: bool = False) -> _Linearised:
@@ -298,7 +253,7 @@ class _Fit:
             unit = (p - self.corners[0]) / np.maximum(np.ptp(self.corners, axis=0), 1e-9)
             matrix = np.column_stack(
                 [
-                    slopes(gradient, yaw, rates)[:, self.free],
+                    slopes(gradient, yaw, rates),
                     _platform(run, rows, yaw, rates),
                     _over_the_area(2 * unit - 1, yaw),
                 ]
@@ -315,10 +270,9 @@ class _Fit:
             blocks = int(parts_block[-1][-1]) + 1
             parts_tile.append(np.clip(unit[kept] * TILES, 0, TILES - 1).astype(int) @ [TILES, 1])
         if not parts_x:
-            return _Linearised(place, place, np.diag(self.prior), np.inf, np.inf, 1.0)
+            return _Linearised(place, place, np.diag(PRIOR), np.inf, np.inf, 1.0)
         x, y, block = np.vstack(parts_x), np.concatenate(parts_y), np.concatenate(parts_block)
-        count = len(self.prior)
-        left = _residual(x[:, count:], np.column_stack([x[:, :count], y]))
+        left = _residual(x[:, 3:], np.column_stack([x[:, :3], y]))
         groups: list[NDArray[np.intp]] = []
         if robust:
             alike = parts_block if len(parts_y) == 1 else [np.full(len(y), k) for k, y in enumerate(parts_y)]
@@ -335,7 +289,6 @@ class _Fit:
         block: NDArray[np.intp],
         groups: Sequence[NDArray[np.intp]],
     ) -> _Linearised:
-        at = place[self.free]
         scale = np.sqrt(np.mean(x**2, axis=0))
         scale[scale == 0] = 1.0  # on a constant map all places are alike
         x = x / scale
@@ -354,22 +307,22 @@ class _Fit:
         values, vectors = np.linalg.eigh(normal)
         blind = vectors[:, values <= 1e-10 * values[-1]]
         unknown = 1e12 * blind @ blind.T
-        prior = np.diag(self.prior)
+        prior = np.diag(PRIOR)
 
         def gain(known: NDArray[Any]) -> Array:
             return prior @ np.linalg.inv(prior + (known + unknown) / np.outer(scale, scale))
 
-        wanted, shrunk = place.copy(), gain(self.alike * promised * inverse)
-        wanted[self.free] = shrunk @ (at + solved / scale)
+        shrunk = gain(self.alike * promised * inverse)
+        wanted = shrunk @ (place + solved / scale)
         if groups:
             spread = np.sum([_sandwich(inverse, x, error, group) for group in groups], axis=0)
-            missed = np.eye(len(prior)) - shrunk
+            missed = np.eye(3) - shrunk
             covariance = shrunk @ (spread / np.outer(scale, scale)) @ shrunk.T + missed @ prior @ missed.T
         else:
             covariance = prior - gain(blocked) @ prior
         left = max(float(np.mean(y**2)), 1e-12)
         self.readings = self.readings or len(y)
-        cost = self.readings / self.alike * np.log(left) + float(np.sum(at**2 / self.prior))
+        cost = self.readings / self.alike * np.log(left) + float(np.sum(place**2 / PRIOR))
         return _Linearised(place, wanted, (covariance + covariance.T) / 2, cost, promised, max(alike, 1.0))
 
 
@@ -420,10 +373,8 @@ def _platform(run: Run, rows: NDArray[np.intp], yaw: Array, rates: Array) -> Arr
 
 def _over_the_area(unit: Array, yaw: Array) -> Array:
     """Columns (M, K) for fields that vary slowly with the place, -1 to 1 along each axis, by heading."""
-    x, y = (legvander(u, DEGREE) for u in unit.T)
     ways = (np.ones(len(yaw)), np.cos(yaw), np.sin(yaw))
-    shapes = [x[:, i] * y[:, j] for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j]
-    return np.column_stack([shape * way for shape in shapes for way in ways])
+    return np.column_stack([shape * way for shape in (unit[:, 1], unit[:, 0]) for way in ways])
 
 
 def _slope(values: Array, t: Array, at: Array) -> Array:

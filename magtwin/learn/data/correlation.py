@@ -1,6 +1,5 @@
 """Rank correlation of each input with the disturbance, as in the paper's Figure 2."""
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -9,8 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.learn.data.dataset import Dataset, open_dataset
-from magtwin.report.report import Figure, Report
 from magtwin.report.summary import Summarized
 
 Array = NDArray[np.float64]
@@ -40,51 +37,22 @@ class Correlations(Summarized):
     groups: int
     """Number of recordings or sessions."""
 
-    def report(self, title: str = "Correlation with the disturbance") -> Report:
-        """Every input with its correlation, its spread, and the paper's correlation."""
-        figures = []
-        for name, rho, sd in zip(self.features, self.rho.tolist(), self.sd.tolist(), strict=True):
-            paper = f"the paper {PAPER[name]:+.2f}" if name in PAPER else ""
-            if np.isnan(rho):
-                figures.append(Figure(name, "never varies"))
-            else:
-                figures.append(Figure(name, round(rho, 4), "", None if np.isnan(sd) else round(sd, 4), paper))
-        method = "Spearman's rank correlation, ties at their mean rank; spread by leaving out groups"
-        return Report(title, tuple(figures), {"rows": self.rows, "groups": self.groups, "method": method})
 
-
-def correlations(
-    x: ArrayLike, y: ArrayLike, features: Sequence[str], groups: ArrayLike | None = None
-) -> Correlations:
+def correlations(x: ArrayLike, y: ArrayLike, features: Sequence[str], groups: ArrayLike) -> Correlations:
     """Spearman's correlation of each input with the label: Pearson's of their ranks (Spearman 1904).
 
     Readings of a run are correlated, so the spread is the jackknife's over groups:
     sd^2 = (G - 1) / G sum over g of (rho_-g - mean)^2, with rho_-g from the rows outside group g, which keep
     their ranks among all rows.
 
-    Args:
-        x: Inputs, shape (N, F).
-        y: Labels [nT], shape (N,).
-        features: Names of the inputs, F of them.
-        groups: Recording or session of each row, whole numbers, shape (N,). Default: one group.
-
-    Raises:
-        InputError: Shapes do not fit, a value is not finite, there are fewer than three rows, or the
-            label never varies.
+    Rows are inputs (N, F) with F names, labels [nT], and recordings or sessions as whole numbers. Fewer than
+    three rows, and labels that never vary, are refused.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
-    if x.ndim != 2 or x.shape != (len(y), len(features)):
-        raise InputError(f"x must have shape {(len(y), len(features))}, a row a label, got {x.shape}")
-    if len(y) < 3 or not (np.isfinite(x).all() and np.isfinite(y).all()):
-        raise InputError(f"correlations need three rows at least, all finite, got {len(y)}")
-    group = np.zeros(len(y), int) if groups is None else np.asarray(groups)
-    if group.shape != y.shape:
-        raise InputError(f"groups must have shape {y.shape}, got {group.shape}")
-    group = np.unique(group, return_inverse=True)[1]
-    b = _ranks(y)
-    if not b.any():
+    group, b = np.unique(groups, return_inverse=True)[1], _ranks(y)
+    if len(y) < 3 or not b.any():
         raise InputError(
-            f"every label is {y[0]:g} nT: there is nothing to correlate with; were they made right?"
+            f"{len(y)} labels of {y[0]:g} nT and more: too few or all alike, so nothing correlates with them"
         )
     count = int(group.max()) + 1
     rho, sd = np.full(len(features), np.nan), np.full(len(features), np.nan)
@@ -101,28 +69,6 @@ def correlations(
             without = _pearson(total - sums)
             sd[i] = np.sqrt((count - 1) / count * np.sum((without - without.mean()) ** 2))
     return Correlations(tuple(features), rho, sd, len(y), count)
-
-
-def correlations_of(
-    dataset: Dataset | str | os.PathLike[str], features: str | Sequence[str] = "full"
-) -> Correlations:
-    """Correlations of a data set's inputs with its labels, grouped by session, or by recording if there is
-    one.
-
-    Args:
-        dataset: The data set, or its folder.
-        features: A set of features, or their names.
-
-    Raises:
-        InputError: As for `correlations`, or the recordings lack a column of a feature.
-    """
-    dataset = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
-    rows = dataset.rows(features)
-    sessions = [dataset.recording(name).session for name in rows.names]
-    keys = rows.names if len(set(sessions)) < 2 else sessions
-    number = {key: i for i, key in enumerate(dict.fromkeys(keys))}
-    groups = np.array([number[key] for key in keys])[rows.recording]
-    return correlations(rows.x, rows.y, rows.features, groups)
 
 
 def _ranks(values: Array) -> Array:

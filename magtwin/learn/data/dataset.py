@@ -14,7 +14,6 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -36,7 +35,7 @@ from magtwin.learn.data.recording import Recording, Rows, Source, plant_name, re
 from magtwin.learn.data.split import Part, Split
 from magtwin.parallel import run_all
 from magtwin.report.report import Figure, Report
-from magtwin.report.summary import Summarized, Summary, listed, span
+from magtwin.report.summary import Summarized, Summary, listed
 from magtwin.run.arrow import run_of, table_of
 from magtwin.run.parquet import check_parquet
 from magtwin.run.run import Metadata, Run
@@ -123,40 +122,7 @@ class Dataset(Summarized):
             with self._opened(recording) as file:
                 with _undamaged(self._path(recording)):
                     table = file.read()
-                yield recording, self._run(table, recording)
-
-    def blocks(
-        self, columns: Sequence[str] | None = None, names: Iterable[str] | None = None
-    ) -> Iterator[tuple[Recording, int, Run]]:
-        """Recordings in blocks of rows, with the number of each block's first row.
-
-        Args:
-            columns: Columns to read beside t. Default: all.
-            names: Recordings. Default: all.
-
-        Raises:
-            InputError: As for `runs`, or the recordings lack a column.
-        """
-        wanted = None
-        if columns is not None:
-            for column in columns:
-                find(f"column in the data set {self.folder}", column, dict.fromkeys(self.columns))
-            wanted = {"t", *columns}
-        for recording in self._named(names):
-            with self._opened(recording) as file:
-                flat = None
-                if wanted is not None:
-                    names_of = {name.encode() for name in wanted}
-                    flat = [
-                        f.name for f in file.schema_arrow if (f.metadata or {}).get(b"column") in names_of
-                    ]
-                first = 0
-                for i in range(file.num_row_groups):
-                    with _undamaged(self._path(recording)):
-                        table = file.read_row_group(i, columns=flat)
-                    block = self._run(table, recording)
-                    yield recording, first, block
-                    first += block.rows
+                yield recording, run_of(table, self._path(recording))
 
     def rows(
         self,
@@ -182,60 +148,54 @@ class Dataset(Summarized):
         """
         wanted = feature_names(features)
         self._check_features((*wanted, *beside))
-        if split is not None:
-            names = split.names(part)
-        chosen = self._named(names)
-        most = sum(recording.labelled for recording in chosen)
-        x, y, sd = np.empty((most, len(wanted))), np.empty(most), np.empty(most)
-        number_of_row, row = np.empty(most, np.intp), np.empty(most, np.intp)
-        others, t = np.empty((most, len(beside))), np.empty(most)
-        number = {recording.name: i for i, recording in enumerate(chosen)}
-        end, unlabelled, incomplete = 0, 0, 0
+        chosen = self._named(names if split is None else split.names(part))
         columns = [*columns_of(wanted), *columns_of(beside), "label_nt", "label_sd_nt"]
-        for recording, first, run in self.blocks(columns, number):
-            label, values = run["label_nt"], features_of(run, wanted)
-            known, complete = np.isfinite(label), np.isfinite(values).all(axis=1)
-            if (vast := complete & (np.abs(values) > LARGEST).any(axis=1)).any():
+        number = {recording.name: i for i, recording in enumerate(chosen)}
+        parts: list[tuple[NDArray[Any], ...]] = []
+        unlabelled, incomplete = 0, 0
+        for recording, first, run in self._blocks(columns, chosen):
+            label, x = run["label_nt"], features_of(run, wanted)
+            known, complete = np.isfinite(label), np.isfinite(x).all(axis=1)
+            if (vast := complete & (np.abs(x) > LARGEST).any(axis=1)).any():
                 i = int(np.argmax(vast))
-                name = wanted[int(np.argmax(np.abs(values[i])))]
+                name = wanted[int(np.argmax(np.abs(x[i])))]
                 raise InputError(
                     f"{self.folder}: {recording.name!r}, row {first + i}: input {name!r} is "
-                    f"{np.abs(values[i]).max():.3g}; write nan for unknown values, and build it anew"
+                    f"{np.abs(x[i]).max():.3g}; write nan for unknown values, and build it anew"
                 )
             mine = np.ones(run.rows, bool)
-            if split is not None and split.by == "row":
+            if split is not None:
                 mine = split.rows(part, recording.name, recording.rows)[first : first + run.rows]
-            kept = mine & known & complete
             unlabelled += int(np.count_nonzero(mine & ~known))
             incomplete += int(np.count_nonzero(mine & known & ~complete))
-            stop = end + int(np.count_nonzero(kept))
-            if stop > most:
-                raise InputError(
-                    f"{self.folder}: {recording.name!r} has more labels than in {MANIFEST}; build it anew"
-                )
-            x[end:stop], y[end:stop], sd[end:stop] = values[kept], label[kept], run["label_sd_nt"][kept]
-            number_of_row[end:stop], row[end:stop] = number[recording.name], first + np.flatnonzero(kept)
-            t[end:stop] = run["t"][kept]
-            if beside:
-                others[end:stop] = features_of(run, beside)[kept]
-            end = stop
-        if not end:
+            kept = np.flatnonzero(mine & known & complete)
+            others = features_of(run.take(kept), beside) if beside else np.empty((len(kept), 0))
+            here = np.full(len(kept), number[recording.name])
+            sd, t = run["label_sd_nt"][kept], run["t"][kept]
+            parts.append((x[kept], label[kept], sd, here, first + kept, others, t))
+        x, y, sd, here, row, others, t = map(np.concatenate, zip(*parts, strict=True))
+        if not len(y):
             raise InputError(
                 f"{self.folder}: no row to learn from: {unlabelled:,} rows have no label and {incomplete:,} "
                 "lack an input; choose others, or other features"
             )
-        return Rows(
-            x=x[:end],
-            y=y[:end],
-            sd=sd[:end],
-            recording=number_of_row[:end],
-            names=tuple(number),
-            features=wanted,
-            left_out=MappingProxyType({"without a label": unlabelled, "without an input": incomplete}),
-            row=row[:end],
-            beside=others[:end],
-            t=t[:end],
-        )
+        return Rows(x=x, y=y, sd=sd, recording=here, names=tuple(number), row=row, beside=others, t=t)
+
+    def _blocks(
+        self, columns: Sequence[str], chosen: Sequence[Recording]
+    ) -> Iterator[tuple[Recording, int, Run]]:
+        """Columns of recordings in blocks of rows, with the number of each block's first row."""
+        wanted = {name.encode() for name in ("t", *columns)}
+        for recording in chosen:
+            with self._opened(recording) as file:
+                flat = [f.name for f in file.schema_arrow if (f.metadata or {}).get(b"column") in wanted]
+                first = 0
+                for i in range(file.num_row_groups):
+                    with _undamaged(self._path(recording)):
+                        table = file.read_row_group(i, columns=flat)
+                    block = run_of(table, self._path(recording))
+                    yield recording, first, block
+                    first += block.rows
 
     def check(self) -> None:
         """Read every shard and compare its checksum.
@@ -264,7 +224,7 @@ class Dataset(Summarized):
             Figure("labels", rows),
             Figure("label", mean, "nT", float(np.sqrt(within + between)), "mean; spread over all rows"),
             Figure("label between recordings", float(np.sqrt(between)), "nT", note="spread of their means"),
-            *self.alignment.report().figures,
+            *self.alignment.figures(),
         ]
         metadata = {
             "map": self.map_name,
@@ -302,37 +262,25 @@ class Dataset(Summarized):
     def _path(self, recording: Recording) -> Path:
         return self.folder / RUNS / f"{recording.name}.parquet"
 
-    def _run(self, table: pa.Table, recording: Recording) -> Run:
-        return run_of(table, self._path(recording))
-
     def _summary(self) -> Summary:
-        rows = sum(recording.rows for recording in self.recordings)
-        labels = sum(recording.labelled for recording in self.recordings)
-        seconds = sum(recording.duration_s for recording in self.recordings)
+        rows, labels = (sum(getattr(each, name) for each in self.recordings) for name in ("rows", "labelled"))
+        minutes = sum(recording.duration_s for recording in self.recordings) / 60
         (x, y), latency = self.alignment.lever_arm_m, self.alignment.latency_s
-        means = [recording.label_mean_nt for recording in self.recordings if recording.labelled]
-        sessions = {recording.session for recording in self.recordings}
         paths = sorted({recording.path for recording in self.recordings})
-        spread = f", means of recordings {span(min(means), max(means), 'nT')}" if means else ""
+        sessions = {recording.session for recording in self.recordings}
         return Summary(
             f"Dataset {self.folder.name}: {len(self.recordings):,} recordings, {rows:,} rows, "
-            f"{seconds / 60:.4g} min",
+            f"{minutes:.4g} min",
             (
                 ("from", f"{len(sessions):,} sessions, {len(paths):,} paths: {listed(paths)}"),
                 ("map", f"{self.map_name}; lever arm ({x:.3g}, {y:.3g}) m, latency {latency:.3g} s"),
-                ("labels", f"{labels:,} rows{spread}"),
+                ("labels", f"{labels:,} rows"),
                 ("columns", f"{len(self.columns)}: {listed(self.columns)}"),
             ),
-            ("recording", "session", "path", "rows", "labels: mean +- sd"),
+            ("recording", "session", "path", "rows", "labels"),
             [
-                (
-                    recording.name,
-                    recording.session,
-                    recording.path,
-                    f"{recording.rows:,}",
-                    f"{recording.label_mean_nt:,.0f} +- {recording.label_sd_nt:,.0f} nT",
-                )
-                for recording in self.recordings
+                (each.name, each.session, each.path, f"{each.rows:,}", f"{each.labelled:,}")
+                for each in self.recordings
             ],
         )
 
@@ -359,24 +307,9 @@ def build_dataset(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Dataset:
-    """Label recordings on a map and write them as a data set; `magtwin.tasks.learning` takes files.
+    """Label recordings on a map and write them as a data set: `magtwin.build_dataset` for sources.
 
-    Args:
-        recordings: Runs by name, or sources that are read one at a time.
-        field: The map.
-        folder: Folder to make.
-        alignment: Lever arm and latency; "fit" fits them to all recordings. None uses pose and reading as
-            they are.
-        map_sha256: Checksum of the map's file. Default: that of its values.
-        rate_hz: Highest rate of readings to keep [Hz]. Default: all.
-        jobs: Processes that share the recordings; they do not change the data set. Default: this process,
-            with several threads.
-        force: Replace an existing folder.
-        progress: Called with the recordings done, their number, and the name of the next.
-
-    Raises:
-        InputError: There is no recording, two have one name, one has no label on the map, lacks a pose or a
-            field, all labels are the same, or the folder exists.
+    `map_sha256` is the checksum of the map's file; default: that of its values.
     """
     sources = sources_of(recordings)
     report = progress or (lambda done, total, what: None)
@@ -391,13 +324,8 @@ def build_dataset(
     if alignment == "fit":
         how = "fitted"
         runs = run_all(_to_align, sources, jobs=jobs, progress=each(0, ": aligning"))
-        alignment = fit_alignment(
-            runs,
-            field,
-            progress=lambda k, n, what: report(
-                len(sources), total, f"lever arm and latency: {k} of {n} {what}"
-            ),
-        )
+        report(len(sources), total, "lever arm and latency")
+        alignment = fit_alignment(runs, field)
         del runs
     elif alignment is not None and not isinstance(alignment, Alignment):
         raise InputError(f'alignment must be "fit", an Alignment or None, got {alignment!r}')

@@ -31,11 +31,6 @@ def labelled(run: Run, field: AnomalyMap, alignment: Alignment | None = None) ->
     of motion capture if the run has it, else the true pose; a run without yaw gets that of motion capture. A
     reading has no label off the map, on masked nodes, without lock or pose, or without a measurement.
 
-    Args:
-        run: Needs t, b_measured_nt, and mocap_p with mocap_q_xyzw or p_world_base with yaw.
-        field: The map. It may differ from the one that the run was simulated with.
-        alignment: Lever arm and latency. Default: 0.
-
     Raises:
         InputError: The run lacks a column, or no reading has a label.
     """

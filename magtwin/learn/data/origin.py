@@ -97,9 +97,6 @@ def mismatches(
         robot: The robot that it is used on.
         platform_sha256: Checksum of that robot's own field.
 
-    Returns:
-        One entry per difference.
-
     Raises:
         InputError: The network's metadata are invalid.
     """
@@ -108,7 +105,7 @@ def mismatches(
         _map_mismatch(metadata, name, field, map_sha256),
         _frame_mismatch(metadata, name, field, residual_sd_nt),
     )
-    return tuple(mismatch for mismatch in each if mismatch is not None)
+    return tuple(filter(None, each))
 
 
 def same_robot(learned: Metadata, used: Metadata) -> bool:
@@ -116,10 +113,6 @@ def same_robot(learned: Metadata, used: Metadata) -> bool:
 
     The robot's platform field and sensor, its plant and the kind of its session must be those of the
     training. Recordings of a real robot do not name these, so they count as those of another robot.
-
-    Args:
-        learned: Metadata of the network.
-        used: Metadata of a run.
     """
     for name in ("platform_sha256", "sensor_m"):
         ours, its = (str(metadata.get(name, UNKNOWN)) for metadata in (learned, used))
@@ -138,10 +131,6 @@ def label_frame(metadata: Metadata, name: str = "") -> tuple[float, float, float
 
     Labels used p(t - latency) + R l of motion capture's pose, which is the true pose of `a` seconds ago minus
     R o. So the map was looked up l - o forward and left of the true place, and latency + a late.
-
-    Args:
-        metadata: Metadata of the network.
-        name: What to call the network in an error.
 
     Returns:
         Forward [m], left [m] and lateness [s]; all 0 if labels used the true pose. None if the offset and age
@@ -271,12 +260,6 @@ def _robot_mismatch(
         return Mismatch(
             f"{name} learned {learned!r} with another [platform] than {robot.name!r} has here: what it "
             "predicts of the robot's own field is off by what was changed; train a network on this robot"
-        )
-    if learned != robot.name:
-        same = "same" if learned_platform == platform_sha256 else "at the same place"
-        return Mismatch(
-            f"{name} learned the robot {learned!r}, and this is {robot.name!r}; its sensor is {same}, so no "
-            "effect is expected if only the name differs"
         )
     return None
 

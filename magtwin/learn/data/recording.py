@@ -134,12 +134,6 @@ class Rows(Summarized):
     names: tuple[str, ...]
     """Recordings."""
 
-    features: tuple[str, ...]
-    """Names of the columns of `x`."""
-
-    left_out: Mapping[str, int]
-    """Number of rows without a label, and of labelled rows without an input."""
-
     row: NDArray[np.intp]
     """Number of each row in its recording, shape (N,)."""
 
@@ -161,7 +155,7 @@ def sources_of(recordings: Mapping[str, Run] | Sequence[Source]) -> list[Source]
     else:
         sources = list(recordings)
     if not sources:
-        raise InputError("a data set needs one recording at least, got none")
+        raise InputError("no recording is named; name one at least")
     seen: set[str] = set()
     for source in sources:
         if not _NAME.fullmatch(source.name) or ".." in source.name:

@@ -36,40 +36,8 @@ class HeldOut:
     """Predicted minus measured [nT], shape (N,)."""
 
 
-@dataclass(frozen=True)
-class Residuals:
-    """Statistics of errors e(t) = offset of the session + u(t)."""
-
-    offset_sd_nt: float
-    """Standard deviation of the offsets of sessions [nT]."""
-
-    within_sd_nt: float
-    """Standard deviation of u [nT]."""
-
-    time_s: float
-    """Correlation time of u [s]: its autocorrelation is exp(-lag / time)."""
-
-    sessions: int
-    """Number of sessions in the estimate."""
-
-    def metadata(self) -> dict[str, float | int]:
-        """The statistics by their names in a weights file."""
-        return {
-            "residual_offset_sd_nt": self.offset_sd_nt,
-            "residual_within_sd_nt": self.within_sd_nt,
-            "residual_time_s": self.time_s,
-            "residual_sessions": self.sessions,
-        }
-
-
 def held_out_errors(rows: Rows, error_nt: Array, recordings: Sequence[Recording]) -> list[HeldOut]:
-    """Split errors by recording.
-
-    Args:
-        rows: The rows of the errors.
-        error_nt: Predicted minus measured [nT], shape (N,).
-        recordings: The recordings of the data set.
-    """
+    """Split errors [nT], shape (N,), of rows by their recordings."""
     by_name = {recording.name: recording for recording in recordings}
     errors = []
     for number, name in enumerate(rows.names):
@@ -81,7 +49,7 @@ def held_out_errors(rows: Rows, error_nt: Array, recordings: Sequence[Recording]
     return errors
 
 
-def residuals(held: Sequence[HeldOut]) -> Residuals | None:
+def residuals(held: Sequence[HeldOut]) -> dict[str, float | int]:
     """Estimate offset, remainder and correlation time of errors by moments.
 
     C(lag) is the mean product of errors a lag apart in a recording. Its expectation is
@@ -99,7 +67,9 @@ def residuals(held: Sequence[HeldOut]) -> Residuals | None:
         held: Errors on recordings that the model was not fitted to.
 
     Returns:
-        The statistics; None if all errors are 0 or there are none.
+        By their names in a weights file: residual_offset_sd_nt and residual_within_sd_nt, the standard
+        deviations of offset and remainder [nT]; residual_time_s, the correlation time of the remainder [s];
+        and residual_sessions, the number of sessions. {} if all errors are 0 or there are none.
     """
     from scipy.optimize import minimize_scalar
 
@@ -107,7 +77,7 @@ def residuals(held: Sequence[HeldOut]) -> Residuals | None:
     total = np.concatenate([errors.error_nt for errors in held]) if held else np.zeros(0)
     variance = float(np.mean(total**2)) if len(total) else 0.0
     if not variance > 0:
-        return None
+        return {}
     lags, products = _autocovariance(held)
     means = np.array([errors.error_nt.mean() for errors in held])
     lengths = np.array([errors.t[-1] - errors.t[0] for errors in held])
@@ -126,10 +96,17 @@ def residuals(held: Sequence[HeldOut]) -> Residuals | None:
         count = len(sessions)
         return variance * (count * share + PRIOR_SESSIONS * PRIOR_SHARE) / (count + PRIOR_SESSIONS)
 
+    def told(offset_nt2: float, time_s: float) -> dict[str, float | int]:
+        return {
+            "residual_offset_sd_nt": offset_nt2**0.5,
+            "residual_within_sd_nt": max(variance - offset_nt2, 0.0) ** 0.5,
+            "residual_time_s": time_s,
+            "residual_sessions": len(sessions),
+        }
+
     step_s = float(lags[1] - lags[0]) if len(lags) > 1 else 0.0
     if not step_s > 0:
-        offset = shrunk_offset(0.0)
-        return Residuals(offset**0.5, (variance - offset) ** 0.5, 0.0, len(sessions))
+        return told(shrunk_offset(0.0), 0.0)
     longest = max(float(lags[-1]), 2 * step_s)  # a slower process looks like an offset
 
     known = np.isfinite(products)
@@ -143,8 +120,7 @@ def residuals(held: Sequence[HeldOut]) -> Residuals | None:
 
     best = minimize_scalar(cost, bounds=(np.log(step_s / 10), np.log(longest)), method="bounded")
     time_s = float(np.exp(best.x))
-    offset = shrunk_offset(time_s)
-    return Residuals(offset**0.5, max(variance - offset, 0.0) ** 0.5, time_s, len(sessions))
+    return told(shrunk_offset(time_s), time_s)
 
 
 def _crossed(held: Sequence[HeldOut], means: Array) -> float | None:

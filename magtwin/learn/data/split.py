@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError, find
 from magtwin.learn.data.recording import Recording
-from magtwin.report.report import Figure, Report
-from magtwin.report.summary import Summarized, Summary, listed
+from magtwin.report.summary import Summarized
 
 By = Literal["session", "run", "path", "row"]
 Part = Literal["train", "validation", "test"]
@@ -99,57 +98,30 @@ class Split(Summarized):
         i = PARTS.index(part)
         return (drawn >= edges[i]) & (drawn < (edges[i + 1] if part != "test" else 2.0))
 
-    def report(self, title: str = "Split") -> Report:
-        """Number of recordings of each part, and the warning."""
-        figures = [Figure(part, len(self.names(part)), "recordings") for part in PARTS]
-        metadata: dict[str, object] = {"by": self.by}
-        if self.leak:
-            metadata["warning"] = self.leak
-        return Report(title, tuple(figures), metadata)
-
-    def _summary(self) -> Summary:
-        return Summary(
-            f"Split by {self.by}",
-            (
-                *((part, f"{len(self.names(part)):,}: {listed(self.names(part), 70)}") for part in PARTS),
-                ("caution", self.leak),
-            ),
-        )
-
 
 def split(
     recordings: Sequence[Recording],
     by: By = "session",
-    shares: tuple[float, float, float] = SHARES,
     hold_out: Sequence[str] = (),
     *,
     rng: np.random.Generator,
 ) -> Split:
     """Split recordings into training, validation and test, keeping sessions, runs or paths whole.
 
-    Groups are taken in random order. Each goes to the part that is furthest below its share of labelled rows;
-    no part with a share stays empty.
+    Groups are taken in random order. Each goes to the part that is furthest below its share of labelled rows,
+    of `SHARES`; no part with a share stays empty.
 
     Args:
         recordings: Such as those of a `Dataset`.
         by: Unit kept whole. "row" splits single rows, for comparison; `Split.leak` warns of it.
-        shares: Shares of labelled rows in training, validation and test; they sum to 1.
         hold_out: Sessions, runs or paths (by `by`), or names of recordings, to put into the test. The others
             then go to training and validation only.
         rng: Source of the order.
 
     Raises:
-        InputError: There are fewer groups than parts, shares do not sum to 1, or a name in `hold_out` is
-            unknown.
+        InputError: There are fewer groups than parts, or a name in `hold_out` is unknown.
     """
-    key = find("way to split", by, _KEYS)
-    numbers = np.asarray(shares, float)
-    if numbers.shape != (3,) or not (np.isfinite(numbers).all() and (numbers >= 0).all() and numbers[0] > 0):
-        raise InputError(f"shares must be three, none below 0 and the first above 0, got {tuple(shares)}")
-    if abs(numbers.sum() - 1) > 1e-6:
-        raise InputError(f"shares must sum to 1, got {tuple(shares)}, which sum to {numbers.sum():g}")
-    if not recordings:
-        raise InputError("there is no recording to split")
+    key, numbers = find("way to split", by, _KEYS), np.array(SHARES)
     known = {key(each) for each in recordings} | {each.name for each in recordings}
     for wanted in hold_out:
         find(f"{by if by != 'row' else 'run'} or recording to hold out", wanted, dict.fromkeys(known))

@@ -32,9 +32,8 @@ from magtwin.learn.data.alignment import Alignment, placed
 from magtwin.learn.data.dataset import Dataset
 from magtwin.learn.data.features import CARRIED, CIRCULAR, FEATURES, GRADIENT, features
 from magtwin.learn.data.labels import labelled
-from magtwin.learn.evaluation.candidates import Candidate, Mean
+from magtwin.learn.evaluation.candidates import Candidate, Mean, aligned_runs
 from magtwin.learn.evaluation.evaluation import Evaluation
-from magtwin.learn.evaluation.training_rows import aligned_runs
 from magtwin.report.summary import Summarized
 from magtwin.run.run import Run
 from magtwin.sim.interference import level_field_nt, platform_field_nt, sensor_places
@@ -45,36 +44,10 @@ Array = NDArray[np.float64]
 TERMS = ("map", "lever arm", "latency", "sessions", "platform", "sensor")
 """The parts of an error, in the order in which they are closed."""
 
-CLOSED = {
-    "map": "the exact field at rest in place of the map",
-    "lever arm": "the true lever arm",
-    "latency": "the true pose when the reading was taken",
-    "sessions": "the robot as in the survey",
-    "platform": "the field of motion, motors, LiDAR and battery",
-    "sensor": "a sensor without noise",
-}
-"""Knowledge of an oracle that closes each term."""
-
-_OTHERS = tuple(term for term in TERMS if term != "platform")
+_OTHERS = [k for k, term in enumerate(TERMS) if term != "platform"]
 
 PENALTY = 1e-3  # Penalty of the ridge for the expectations, relative to the curvature of the rows
 BUDGET_HZ = 20.0  # Highest rate of readings in a budget [Hz]; their exact field takes time
-
-
-@dataclass(frozen=True)
-class Term:
-    """One term of a budget."""
-
-    name: str
-
-    rms_nt: float
-    """RMS of its part of the error [nT]."""
-
-    alone_nt: float
-    """MAE with only this term closed [nT]."""
-
-    after_nt: float
-    """MAE with this term and all before it closed [nT]."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -84,87 +57,35 @@ class Budget(Summarized):
     name: str
     """Name of the model."""
 
-    rows: int
-    """Number of readings."""
-
     mae_nt: float
-    naive_mae_nt: float
 
-    terms: tuple[Term, ...]
-    """In the order of `TERMS`."""
-
-    @property
-    def bought(self) -> tuple[float, ...]:
-        """Reduction of the MAE by closing each term after those before it [nT]; they add up to the MAE."""
-        after = [self.mae_nt, *(term.after_nt for term in self.terms)]
-        return tuple(before - now for before, now in itertools.pairwise(after))
+    left_nt: tuple[float, ...]
+    """MAE with each of `TERMS` closed, and all before it [nT]."""
 
     def summary(self) -> dict[str, Any]:
         """All figures as plain numbers and texts."""
-        return {
-            "model": self.name,
-            "rows": self.rows,
-            "mae_nt": self.mae_nt,
-            "naive_mae_nt": self.naive_mae_nt,
-            "terms": [
-                {
-                    "name": term.name,
-                    "closed_by": CLOSED[term.name],
-                    "rms_nt": term.rms_nt,
-                    "mae_closed_alone_nt": term.alone_nt,
-                    "mae_closed_in_turn_nt": term.after_nt,
-                    "ratio_closed_in_turn": term.after_nt / self.naive_mae_nt,
-                    "bought_nt": bought,
-                }
-                for term, bought in zip(self.terms, self.bought, strict=True)
-            ],
-        }
-
-
-@dataclass(frozen=True)
-class TrueError:
-    """Error of a map for the surveying robot, on the readings of an evaluation."""
-
-    map: str
-    mae_nt: float
-    rms_nt: float
-    bias_nt: float
+        terms = [
+            {"name": name, "mae_closed_in_turn_nt": left}
+            for name, left in zip(TERMS, self.left_nt, strict=True)
+        ]
+        return {"model": self.name, "mae_nt": self.mae_nt, "terms": terms}
 
 
 class Truth:
     """Exact fields of a twin along a run, and their parts of a model's error."""
 
     def __init__(self, surveyed: Scene, scene_of: Callable[[str, Run], Scene]) -> None:
-        """Use a twin.
-
-        Args:
-            surveyed: The scene, with its robot as in the survey.
-            scene_of: From a run's name and the run to the scene with its robot as in the run's session.
-        """
+        """Use a scene with its robot as in the survey, and that with its robot as in the session of a run."""
         self.surveyed, self.scene_of = surveyed, scene_of
         self._exact: dict[tuple[str, Alignment | None], Array] = {}
 
     def parts(
-        self,
-        name: str,
-        run: Run,
-        rows: NDArray[np.intp],
-        map_nt: Array,
-        alignment: Alignment,
-        measured: Array,
+        self, name: str, run: Run, rows: NDArray[np.intp], map_nt: Array, alignment: Alignment, b_nt: Array
     ) -> Array:
         """D1 to D6 of the module, by `TERMS`, shape (6, len(rows)) [nT].
 
-        Args:
-            name: Name of the run; a name always stands for the same run and rows.
-            run: Needs the true pose p_world_base with yaw, and b_truth_nt.
-            rows: Numbers of readings.
-            map_nt: The map at the assumed place of the sensor, at these readings [nT].
-            alignment: Lever arm and latency of that place.
-            measured: The readings [nT].
-
-        Raises:
-            InputError: The run has no truth.
+        `map_nt` and `b_nt` are the map at the assumed place of the sensor, and the readings, at these rows. A
+        name always stands for the same run and rows. A run without the truth is refused.
         """
         for column in ("p_world_base", "yaw", "b_truth_nt"):
             if column not in run or not np.isfinite(run[column]).any():
@@ -173,147 +94,80 @@ class Truth:
                     "leave --scene out"
                 )
         if (name, None) not in self._exact:
-            p, yaw = run["p_world_base"][rows, :2], run["yaw"][rows]
-            both = [self.at_rest(p, yaw), self.at_rest(p, yaw, self.scene_of(name, run))]
+            pose = run["p_world_base"][rows, :2], run["yaw"][rows]
+            both = [at_rest_nt(scene, *pose) for scene in (self.surveyed, self.scene_of(name, run))]
             self._exact[name, None] = np.stack(both)
         if (name, alignment) not in self._exact:
-            scene = self.scene_of(name, run)
             seen = {"mocap_p", "mocap_q_xyzw"} <= set(run)
-            arm = Alignment(scene.robot.mocap.offset_m if seen else (0.0, 0.0), alignment.latency_s)
-            poses = [placed(run, each) for each in (alignment, arm)]
-            self._exact[name, alignment] = np.stack([self.at_rest(p[rows], yaw[rows]) for p, yaw, _ in poses])
-        at_rest, in_session = self._exact[name, None]
-        at_place, at_true_arm = self._exact[name, alignment]
-        truth = run["b_truth_nt"][rows]
-        return np.stack(
-            [
-                map_nt - at_place,
-                at_place - at_true_arm,
-                at_true_arm - at_rest,
-                at_rest - in_session,
-                in_session - truth,
-                truth - measured,
-            ]
-        )
-
-    def at_rest(self, p_xy: Array, yaw: Array, scene: Scene | None = None) -> Array:
-        """Exact field magnitude at the magnetometer of a robot at rest with its LiDAR off [nT].
-
-        It is that of `magtwin.sim.survey.field_at_rest_nt` within 1e-3 nT.
-
-        Args:
-            p_xy: Positions of base_link [m], shape (N, 2).
-            yaw: Headings [rad], shape (N,).
-            scene: The scene in another session. Default: as in the survey.
-
-        Returns:
-            Field magnitude [nT], shape (N,); nan if the pose is nan.
-        """
-        scene = scene or self.surveyed
-        pose = np.column_stack([p_xy, yaw])
-        known = np.isfinite(pose).all(axis=1)
-        field = np.full(len(pose), np.nan)
-        if known.any():
-            place = sensor_places(scene.robot, pose[known])
-            b = level_field_nt(scene, place[:, :2], float(place[0, 2]))[0]
-            b[:, :2] = into_base(b[:, :2], pose[known, 2])
-            field[known] = np.linalg.norm(platform_field_nt(scene.robot.platform, b), axis=1)
-        return field
+            offset = self.scene_of(name, run).robot.mocap.offset_m if seen else (0.0, 0.0)
+            poses = [placed(run, each) for each in (alignment, Alignment(offset, alignment.latency_s))]
+            fields = [at_rest_nt(self.surveyed, p[rows], yaw[rows]) for p, yaw, _ in poses]
+            self._exact[name, alignment] = np.stack(fields)
+        places, here = self._exact[name, alignment], self._exact[name, None]
+        steps = (map_nt, *places, *here, run["b_truth_nt"][rows], b_nt)
+        return np.array([before - after for before, after in itertools.pairwise(steps)])
 
 
-def budgets(
-    evaluation: Evaluation,
-    models: Sequence[int],
-    truth: Truth,
-    train: Dataset,
-    names: Sequence[str] | None = None,
-    *,
-    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
-) -> list[Budget]:
-    """Error budgets of some models of an evaluation.
+def at_rest_nt(scene: Scene, p_xy: Array, yaw: Array) -> Array:
+    """Exact field magnitude at the magnetometer of a robot at rest with its LiDAR off [nT], shape (N,).
 
-    Args:
-        evaluation: The evaluation.
-        models: Numbers of models.
-        truth: The twin that made the recordings and the training recordings.
-        train: Training recordings, for the expectations.
-        names: Which of them. Default: all.
-        progress: Called with the models done, their number, and the name of the next.
-
-    Raises:
-        InputError: A recording has no truth, or is of another scene.
+    It is that of `magtwin.sim.survey.field_at_rest_nt` within 1e-3 nT; nan if the pose of base_link, (N, 2)
+    [m] and (N,) [rad], is nan.
     """
-    made = []
-    for k, m in enumerate(models):
-        progress(k, len(models), evaluation.names[m])
-        made.append(_budget(evaluation, m, truth, train, names))
-    progress(len(models), len(models), "")
-    return made
+    pose = np.column_stack([p_xy, yaw])
+    known = np.isfinite(pose).all(axis=1)
+    field = np.full(len(pose), np.nan)
+    if known.any():
+        place = sensor_places(scene.robot, pose[known])
+        b = level_field_nt(scene, place[:, :2], float(place[0, 2]))[0]
+        b[:, :2] = into_base(b[:, :2], pose[known, 2])
+        field[known] = np.linalg.norm(platform_field_nt(scene.robot.platform, b), axis=1)
+    return field
 
 
-def _budget(
-    evaluation: Evaluation, m: int, truth: Truth, train: Dataset, names: Sequence[str] | None
+def budget(
+    evaluation: Evaluation, m: int, truth: Truth, train: Dataset, names: Sequence[str] | None = None
 ) -> Budget:
+    """Error budget of model `m` of an evaluation: `magtwin.error_budget` for one model.
+
+    The expectations are fitted to the recordings `names` of `train`, by default to all.
+    """
     candidate = evaluation.candidates[m]
     inputs = _inputs(candidate, evaluation, train)
-    learned = _learned(candidate, inputs, truth, train, names)
-    errors, parts, naive = [], [], []
-    for judged in evaluation.judged:
-        rows = _thinned(judged.run, judged.kept)
-        measured = judged.measured_nt[rows]
-        exact = truth.parts(
-            f"judged {judged.name}", judged.run, rows, judged.map_nt[m, rows], candidate.alignment, measured
-        )
-        run = judged.run.take(rows)
-        if any(set(FEATURES[name].columns) & {"b_map_gradient_nt_m"} for name in inputs):
-            run = labelled(judged.run, candidate.map.field, candidate.alignment).take(rows)
-        expected = learned(features(run, inputs)).T
-        part = dict(zip(TERMS, exact, strict=True))
-        for term, expectation in zip(_OTHERS, expected, strict=True):
-            part[term] = part[term] - expectation
-        error = judged.total_nt[m, rows] - measured
-        part["platform"] = error - sum(part[term] for term in _OTHERS)
-        errors.append(error)
-        naive.append(judged.total_nt[0, rows] - measured)
-        parts.append(np.stack([part[term] for term in TERMS]))
-    error, whole = np.concatenate(errors), np.concatenate(parts, axis=1)
-    left, terms = error, []
-    for k, term in enumerate(TERMS):
-        left = left - whole[k]
-        rms = float(np.sqrt(np.mean(whole[k] ** 2)))
-        terms.append(Term(term, rms, _mae(error - whole[k]), _mae(left)))
-    return Budget(candidate.name, len(error), _mae(error), _mae(np.concatenate(naive)), tuple(terms))
-
-
-def _learned(
-    candidate: Candidate, inputs: Sequence[str], truth: Truth, train: Dataset, names: Sequence[str] | None
-) -> "_Expectation":
-    """Expectations of each term but the platform's given the inputs, from training recordings."""
     xs, ys = [], []
     for name, run in aligned_runs(train, names, candidate.map.field, candidate.alignment):
-        x, rows = features(run, inputs), np.arange(run.rows)
-        called, measured = f"training {name}", run["b_measured_nt"]
-        exact = truth.parts(called, run, rows, run["b_map_nt"], candidate.alignment, measured)
+        x, rows, b_nt = features(run, inputs), np.arange(run.rows), run["b_measured_nt"]
+        exact = truth.parts(f"training {name}", run, rows, run["b_map_nt"], candidate.alignment, b_nt)
         whole = np.isfinite(run["label_nt"]) & np.isfinite(x).all(axis=1) & np.isfinite(exact).all(axis=0)
         xs.append(x[whole])
-        ys.append(exact[[TERMS.index(term) for term in _OTHERS]][:, whole].T)
-    return _Expectation(np.concatenate(xs), np.concatenate(ys))
+        ys.append(exact[_OTHERS][:, whole].T)
+    expected = _expectation(np.concatenate(xs), np.concatenate(ys))
+    errors, parts = [], []
+    for judged in evaluation.judged:
+        rows = _thinned(judged.run, judged.kept)
+        name, map_nt, b_nt = f"judged {judged.name}", judged.map_nt[m, rows], judged.measured_nt[rows]
+        part = truth.parts(name, judged.run, rows, map_nt, candidate.alignment, b_nt)
+        run = judged.run.take(rows)
+        if any("b_map_gradient_nt_m" in FEATURES[name].columns for name in inputs):
+            run = labelled(judged.run, candidate.map.field, candidate.alignment).take(rows)
+        part[_OTHERS] -= expected(features(run, inputs)).T
+        error = judged.total_nt[m, rows] - b_nt
+        part[TERMS.index("platform")] = error - part[_OTHERS].sum(axis=0)
+        errors.append(error)
+        parts.append(part)
+    error = np.concatenate(errors)
+    left = error - np.cumsum(np.concatenate(parts, axis=1), axis=0)
+    return Budget(candidate.name, _mae(error), tuple(map(_mae, left)))
 
 
-class _Expectation:
-    """E[y | x] of several y by ridge regression."""
-
-    def __init__(self, x: Array, y: Array) -> None:
-        """Fit to rows (N, F) and targets (N, T)."""
-        self.mean, self.scale, self.offset = x.mean(axis=0), x.std(axis=0), y.mean(axis=0)
-        self.scale[self.scale <= 1e-12 * np.maximum(1.0, np.abs(self.mean))] = 1.0
-        z = (x - self.mean) / self.scale
-        curvature = z.T @ z + PENALTY * len(z) * np.eye(z.shape[1])
-        self.weights = np.linalg.solve(curvature, z.T @ (y - self.offset))
-
-    def __call__(self, x: Array) -> Array:
-        """Expectations at rows (N, F), shape (N, T)."""
-        return np.asarray(self.offset + (x - self.mean) / self.scale @ self.weights)
+def _expectation(x: Array, y: Array) -> Callable[[Array], Array]:
+    """E[y | x] by ridge regression, from rows (N, F) and targets (N, T)."""
+    mean, scale, offset = x.mean(axis=0), x.std(axis=0), y.mean(axis=0)
+    scale[scale <= 1e-12 * np.maximum(1.0, np.abs(mean))] = 1.0
+    z = (x - mean) / scale
+    curvature = z.T @ z + PENALTY * len(z) * np.eye(z.shape[1])
+    weights = np.linalg.solve(curvature, z.T @ (y - offset))
+    return lambda x: np.asarray(offset + (x - mean) / scale @ weights)
 
 
 def _inputs(candidate: Candidate, evaluation: Evaluation, train: Dataset) -> tuple[str, ...]:
@@ -325,42 +179,6 @@ def _inputs(candidate: Candidate, evaluation: Evaluation, train: Dataset) -> tup
     reads = set(candidate.model.features) & {*GRADIENT, *CARRIED}
     wanted = (*CIRCULAR, *(name for name in (*GRADIENT, *CARRIED) if name in reads))
     return tuple(name for name in wanted if set(FEATURES[name].columns) <= able)
-
-
-def true_errors(evaluation: Evaluation, truth: Truth) -> list[TrueError]:
-    """Error of each map for the surveying robot at rest, on the readings judged on."""
-    errors = []
-    for named in evaluation.maps:
-        m = next(i for i, candidate in enumerate(evaluation.candidates) if candidate.map is named)
-        missed = []
-        for judged in evaluation.judged:
-            rows = _thinned(judged.run, judged.kept)
-            place, yaw, _ = placed(judged.run, evaluation.candidates[m].alignment)
-            exact = truth.at_rest(place[rows], yaw[rows])
-            missed.append(judged.map_nt[m, rows] - exact)
-        error = np.concatenate(missed)
-        errors.append(
-            TrueError(named.name, _mae(error), float(np.sqrt(np.mean(error**2))), float(np.mean(error)))
-        )
-    return errors
-
-
-def steps(evaluation: Evaluation) -> list[int]:
-    """Order of models from the paper's configuration on.
-
-    Maps come in order, and on each of them Tolles and Lawson's, the same with gradient terms, then weights.
-    On the first map the weights come first.
-    """
-
-    def rank(m: int) -> tuple[int, ...]:
-        candidate = evaluation.candidates[m]
-        place = evaluation.maps.index(candidate.map)
-        own = "sha256" in candidate.metadata
-        gradient = bool(set(candidate.model.features) & set(GRADIENT))
-        aligned = candidate.alignment != Alignment()
-        return (place, int(own) if place else int(not own), int(gradient), int(aligned), m)
-
-    return [0, *sorted(range(1, len(evaluation.candidates)), key=rank)]
 
 
 def _thinned(run: Run, kept: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -2,36 +2,32 @@
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.alignment import Alignment, alignment_of
 from magtwin.learn.data.dataset import Dataset, values_sha256
-from magtwin.learn.data.features import CARRIED, CIRCULAR, FEATURES, GRADIENT
+from magtwin.learn.data.features import CIRCULAR, FEATURES, features
+from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.origin import same_map
-from magtwin.learn.evaluation.training_rows import alignment_on, training_rows
+from magtwin.learn.data.recording import thinned
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer, Read
 from magtwin.learn.models.linear import fit_linear
-from magtwin.report.summary import Summarized, Summary, listed
+from magtwin.report.summary import Summarized
 from magtwin.run.run import Run
+
+Array = NDArray[np.float64]
 
 NAIVE = "naive"  # Name of the naive model
 
-
-class Model(Protocol):
-    """Predicts a disturbance; a `NeuralMagnetometer` is one."""
-
-    @property
-    def features(self) -> tuple[str, ...]:
-        """Names of its inputs."""
-
-    def read(self, runs: Sequence[Run]) -> list[Read]:
-        """Disturbances, their standard deviations, and rows outside the training ranges, of each run."""
+TRAINED_AT_HZ = 10.0
+"""Highest rate of training rows of a baseline [Hz]; nearer rows are too alike to add information."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +63,7 @@ class NamedMap(Summarized):
 
 
 def named_map(name: str, anomaly_map: AnomalyMap, *checksums: str) -> NamedMap:
-    """A map with its checksums.
-
-    Args:
-        name: What to call it.
-        anomaly_map: The map.
-        checksums: SHA-256 of its file, if it has one. That of its values is added.
-    """
+    """A map with its checksums: the SHA-256 of its file, if it has one, and that of its values."""
     return NamedMap(name, anomaly_map, frozenset({*filter(None, checksums), values_sha256(anomaly_map)}))
 
 
@@ -82,21 +72,11 @@ class Candidate(Summarized):
     """A model with the map, lever arm and latency that it learned with."""
 
     name: str
-    model: Model
+    model: NeuralMagnetometer | Mean
     map: NamedMap
     alignment: Alignment = field(default_factory=Alignment)
     metadata: Mapping[str, Any] = field(default_factory=dict)
     """Metadata of its file, or how it was fitted."""
-
-    def _summary(self) -> Summary:
-        (x, y), latency = self.alignment.lever_arm_m, self.alignment.latency_s
-        return Summary(
-            f"Candidate {self.name}: on map {self.map.name}",
-            (
-                ("inputs", f"{len(self.model.features)}: {listed(self.model.features)}"),
-                ("alignment", f"lever arm ({x:.3g}, {y:.3g}) m, latency {latency:.3g} s"),
-            ),
-        )
 
 
 def candidate_of(
@@ -154,8 +134,8 @@ def naive(
         InputError: The mean is not known.
     """
     if dataset is not None:
-        alignment = alignment_on(dataset, named.checksums)
-        labels = training_rows(dataset, names, named.field, (), alignment)[1]
+        alignment = _alignment_on(dataset, named.checksums)
+        labels = _training_rows(dataset, names, named.field, (), alignment)[1]
         model = Mean(float(labels.mean()), float(labels.std()))
         return Candidate(NAIVE, model, named, alignment, {"fitted to": dataset.folder.name})
     for candidate in weights:
@@ -178,32 +158,21 @@ def tolles_lawson(
     dataset: Dataset,
     names: Sequence[str] | None = None,
     *,
-    gradient: bool = False,
     alignment: Alignment | None = None,
 ) -> Candidate:
-    """A ridge regression of Tolles and Lawson's kind: heading, motion, currents, and the map's gradient.
+    """A ridge regression of Tolles and Lawson's kind, on heading, motion and currents.
 
-    Args:
-        named: The map.
-        dataset: Training recordings, which are labelled on it.
-        names: Which of them. Default: all.
-        gradient: Add the terms of a lever arm and a latency to the inputs.
-        alignment: Lever arm and latency. Default: those of the data set if it was labelled on this map, else
-            0.
-
-    Raises:
-        InputError: A recording has no label on the map.
+    It is fitted to recordings of a data set, labelled on a map with a lever arm and latency; default: those
+    of the data set if it was labelled on this map, else 0.
     """
     given = alignment is not None
-    alignment = alignment or alignment_on(dataset, named.checksums)
-    wanted = (*CIRCULAR, *GRADIENT, *CARRIED) if gradient else CIRCULAR
-    able = set(dataset.columns) | {"yaw", "b_map_gradient_nt_m"}
-    inputs = tuple(name for name in wanted if set(FEATURES[name].columns) <= able)
-    x, y, sd, session = training_rows(dataset, names, named.field, inputs, alignment)
+    alignment = alignment or _alignment_on(dataset, named.checksums)
+    able = set(dataset.columns) | {"yaw"}
+    inputs = tuple(name for name in CIRCULAR if set(FEATURES[name].columns) <= able)
+    x, y, sd, session = _training_rows(dataset, names, named.field, inputs, alignment)
     model = fit_linear(x, y, session, features=inputs, sd=sd).model
-    kind = "Tolles-Lawson and gradient" if gradient else "Tolles-Lawson"
     about = {"fitted to": dataset.folder.name, "penalty": model.penalty, "training rows": len(y)}
-    name = f"{kind}, {named.name}{' aligned' * given}"
+    name = f"Tolles-Lawson, {named.name}{' aligned' * given}"
     return Candidate(name, NeuralMagnetometer(model, name=name), named, alignment, about)
 
 
@@ -213,24 +182,53 @@ def tolles_lawson_variants(
     dataset: Dataset,
     names: Sequence[str] | None = None,
 ) -> list[Candidate]:
-    """Tolles and Lawson's ridge on each map: plain, with the candidates' alignment, and with gradient terms.
-
-    Args:
-        maps: The maps.
-        candidates: Models whose lever arm and latency are used.
-        dataset: Training recordings.
-        names: Which of them. Default: all.
-    """
+    """Tolles and Lawson's ridge on each map: plain, and with the alignment of the first candidate on it."""
     variants = []
     for named in maps:
-        fitted = [
-            candidate.alignment
-            for candidate in candidates
-            if candidate.map is named and candidate.alignment != Alignment()
-        ]
+        fitted = [each.alignment for each in candidates if each.map is named]
+        fitted = [alignment for alignment in fitted if alignment != Alignment()]
         variants.append(tolles_lawson(named, dataset, names))
         if fitted and variants[-1].alignment == Alignment():
             variants.append(tolles_lawson(named, dataset, names, alignment=fitted[0]))
-        aligned = variants[-1].alignment if variants[-1].alignment in fitted else None
-        variants.append(tolles_lawson(named, dataset, names, gradient=True, alignment=aligned))
     return variants
+
+
+def _training_rows(
+    dataset: Dataset,
+    names: Sequence[str] | None,
+    anomaly_map: AnomalyMap,
+    inputs: Sequence[str],
+    alignment: Alignment,
+) -> tuple[Array, Array, Array, NDArray[np.intp]]:
+    """Inputs (N, F), labels and standard deviations of the map [nT], and sessions (N,) of recordings."""
+    parts = []
+    sessions = [recording.session for recording in dataset.recordings]
+    for name, run in aligned_runs(dataset, names, anomaly_map, alignment):
+        x, y = features(run, inputs), run["label_nt"]
+        known = np.isfinite(y) & np.isfinite(x).all(axis=1)
+        number = sessions.index(dataset.recording(name).session)
+        parts.append((x[known], y[known], run["label_sd_nt"][known], np.full(int(known.sum()), number)))
+    x, y, sd, session = (np.concatenate(column) for column in zip(*parts, strict=True))
+    if not len(y):
+        raise InputError(
+            f"{dataset.folder}: no training row has a label on {anomaly_map.name} and all inputs"
+        )
+    return x, y, sd, session
+
+
+def aligned_runs(
+    dataset: Dataset, names: Sequence[str] | None, anomaly_map: AnomalyMap, alignment: Alignment
+) -> Iterator[tuple[str, Run]]:
+    """Names and runs of training recordings, at most `TRAINED_AT_HZ` rows a second, labelled on a map."""
+    for recording, run in dataset.runs(names):
+        try:
+            yield recording.name, labelled(thinned(run, TRAINED_AT_HZ), anomaly_map, alignment)
+        except InputError as error:
+            raise InputError(f"{dataset.folder}, {recording.name}: {error}") from error
+
+
+def _alignment_on(dataset: Dataset, checksums: Collection[str]) -> Alignment:
+    """Lever arm and latency of a data set that was labelled on a map with one of these checksums, else 0."""
+    if dataset.map_sha256 not in checksums:
+        return Alignment()
+    return Alignment(dataset.alignment.lever_arm_m, dataset.alignment.latency_s)

@@ -233,8 +233,8 @@ class Evaluation(Summarized):
     def _summary(self) -> Summary:
         every = self.every
         models = [
-            (name, f"MAE {score.mae_nt:.4g} nT, {score.ratio:.3g} of naive, {_covered(score)}")
-            for name, score in zip(self.names, every.scores, strict=True)
+            (name, f"MAE {one.mae_nt:.4g} nT, {one.ratio:.3g} of naive, {one.coverage:.0%} in 90 % intervals")
+            for name, one in zip(self.names, every.scores, strict=True)
         ]
         return Summary(
             f"Evaluation: {len(self.names) - 1} models, {every.recordings:,} recordings, "
@@ -243,11 +243,6 @@ class Evaluation(Summarized):
             ("case", *self.names),
             [(case.name, *(f"{score.mae_nt:.4g} nT" for score in case.scores)) for case in self.cases],
         )
-
-
-def _covered(score: Score) -> str:
-    """Share of the readings in the predicted intervals, in words."""
-    return "no interval" if math.isnan(score.coverage) else f"{100 * score.coverage:.3g} % in 90 % intervals"
 
 
 def _finite(value: Any) -> Any:

@@ -3,12 +3,11 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError
-from magtwin.report.summary import Summarized
 from magtwin.report.verdict import Z_90
 
 Array = NDArray[np.float64]
@@ -57,27 +56,20 @@ class Score:
     """Share of the readings with an input outside the training ranges."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Errors(Summarized):
-    """Errors of several models on the readings of one run."""
+class Errors(NamedTuple):
+    """Errors of several models on the readings of one run.
+
+    Its session, its row of the table, times [s], shape (N,), predicted minus measured [nT], shape (M, N),
+    predicted standard deviations [nT], nan if there is none, and whether an input is outside the training
+    ranges.
+    """
 
     session: str
-    """Its session."""
-
     group: str
-    """Its row of the table."""
-
     t: Array
-    """Times, shape (N,) [s]."""
-
     error_nt: Array
-    """Predicted minus measured [nT], shape (M, N); all finite."""
-
     sd_nt: Array
-    """Predicted standard deviations [nT], shape (M, N); nan if there is none."""
-
     outside: NDArray[np.bool_]
-    """Whether an input is outside the training ranges, shape (M, N)."""
 
     def sums(self) -> tuple[Array, Array]:
         """Readings in each block of `BLOCK_S`, (K,), and the sums that scores are computed from, (K, M,
@@ -104,20 +96,10 @@ def scores(
     1989 for blocks). With one session or one run only the lower levels are resampled, and the interval does
     not cover other sessions.
 
-    Args:
-        runs: Errors by run, of the same models.
-        rng: Source of the draws.
-        draws: Number of resamples.
-
     Returns:
         Scores of each model by group, in order of first appearance; on all readings; and in the mean over
         groups.
-
-    Raises:
-        InputError: There is no run.
     """
-    if not runs:
-        raise InputError("no run to score")
     groups = list(dict.fromkeys(run.group for run in runs))
     children = iter(rng.spawn(len(groups) + 1))
     by_group: dict[str, tuple[Score, ...]] = {}

@@ -17,8 +17,8 @@ from magtwin.learn.data.features import columns_of, features
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.origin import same_map
 from magtwin.learn.data.recording import Source, read, session_name
+from magtwin.learn.mixed.effects import RATE_HZ, thinned_rows
 from magtwin.learn.mixed.mixed import Mixed
-from magtwin.learn.mixed.session_effects import RATE_HZ, thinned_rows
 from magtwin.learn.models.predictor import Predictor
 from magtwin.learn.models.weights import MetadataValue
 from magtwin.run.run import Run
@@ -78,17 +78,10 @@ def labelled_drive(
     rate_hz: float | None = RATE_HZ,
     name: str = "the drive",
 ) -> LabelledDrive:
-    """Features and labels of a drive, with the lever arm and latency in a model's metadata.
+    """Features and labels of a drive on a map, with the lever arm and latency in a model's metadata.
 
-    Args:
-        model: The model.
-        run: The drive, with poses and measured field.
-        field: The map.
-        rate_hz: Highest rate of the readings [Hz]. None: all.
-        name: What to call the drive in an error.
-
-    Raises:
-        InputError: The drive has no label on the map, its field comes from a network, or it lacks a column.
+    At most `rate_hz` readings a second are taken. A drive without labels on the map, with readings of a
+    network, or without a column of the model is refused by its `name`.
     """
     run = read(Source("drive", lambda: run))
     try:
@@ -118,26 +111,13 @@ def calibrate(
     parent: Mapping[str, MetadataValue] | None = None,
     name: str = "",
 ) -> Mixed:
-    """Calibrate a mixed model by a labelled drive; see `magtwin.calibrate`.
+    """Calibrate a mixed model by a labelled drive: `magtwin.calibrate` for a model and a run.
 
-    Args:
-        model: A mixed model.
-        run: The drive.
-        field: The map that the model was trained on.
-        duration_s: Length of the part to use, from the start [s]. Default: all.
-        pose_sd_m: Standard deviation of the drive's positions, each axis [m].
-        pose_from_map: Whether the poses were estimated on the map.
-        parent: Metadata about the file of the model.
-        name: Name of the drive, for the metadata.
-
-    Raises:
-        InputError: The model is of another kind, or the drive has too few labelled readings.
+    `parent` is metadata about the file of the model, `name` that of the drive.
     """
     what = name or "the drive"
     model = mixed_of_kind(model)
-    if not 0 <= pose_sd_m <= MOST_SD_M:
-        most = f", at most {MOST_SD_M:g} m" if pose_sd_m > MOST_SD_M else ""
-        raise InputError(f"pose_sd_m must be 0 or more and finite{most}, got {pose_sd_m!r}")
+    check_pose_sd(pose_sd_m)
     if duration_s is not None and not 0 < duration_s < math.inf:
         raise InputError(f"duration_s must be above 0 s and finite, got {duration_s!r}")
     drive = labelled_drive(model, run, field, name=what)
@@ -199,6 +179,12 @@ def mixed_of_kind(model: Predictor) -> Mixed:
             f"a model of the kind {model.kind!r} has no effects of a session; train one with --model mixed"
         )
     return model
+
+
+def check_pose_sd(pose_sd_m: float) -> None:
+    """Refuse a standard deviation of positions below 0, or above `MOST_SD_M`."""
+    if not 0 <= pose_sd_m <= MOST_SD_M:
+        raise InputError(f"pose_sd_m must be between 0 and {MOST_SD_M:g} m, got {pose_sd_m!r}")
 
 
 def _cautions(drive: LabelledDrive, run: Run, *, pose_from_map: bool) -> list[str]:

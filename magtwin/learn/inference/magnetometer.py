@@ -15,7 +15,6 @@ from magtwin.learn.data.features import columns_of, features
 from magtwin.learn.data.origin import same_robot
 from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.predictor import Predictor, load_predictor
-from magtwin.learn.models.regressor import summary_of
 from magtwin.learn.models.weights import MetadataValue
 from magtwin.report.summary import Summarized, Summary
 from magtwin.report.verdict import OF_DRIVE, ONLY_OWN, OTHERS, OWN
@@ -132,14 +131,6 @@ class NeuralMagnetometer(Summarized):
             metadata["network_label_mean_nt"] = float(self.net.metadata["label_mean_nt"])
         return metadata if self.net.kind == "mlp" else metadata | {"network_kind": self.net.kind}
 
-    def disturbance_nt(self, run: Run) -> Array:
-        """Disturbance at each reading of a run [nT], shape (N,).
-
-        Raises:
-            InputError: The run lacks a column that the network reads.
-        """
-        return self.read([run], outside=False, known=[True])[0].disturbance_nt
-
     def knows(self, metadata: Mapping[str, MetadataValue]) -> bool:
         """Whether it was trained on the robot of a run, by the run's metadata; see `same_robot`."""
         return same_robot(self.net.metadata, metadata)
@@ -157,15 +148,15 @@ class NeuralMagnetometer(Summarized):
         Raises:
             InputError: A run lacks a column that the network reads.
         """
-        known = [self.knows(run.metadata) for run in runs] if known is None else known
-        return [self._read(run, outside, own) for run, own in zip(runs, known, strict=True)]
-
-    def _read(self, run: Run, outside: bool, known: bool) -> Read:
-        x = features(run, self.features)
-        mean, sd = self.net.predict(x)
-        wide = None if known else self.net.wide_sd_nt(x)
-        flags = self.net.outside(x) if outside else None
-        return Read(mean, sd, flags, wide, self._intervals(known, wide is not None))
+        made = []
+        for run, own in zip(runs, [None] * len(runs) if known is None else known, strict=True):
+            own = self.knows(run.metadata) if own is None else own
+            x = features(run, self.features)
+            mean, sd = self.net.predict(x)
+            wide = None if own else self.net.wide_sd_nt(x)
+            flags = self.net.outside(x) if outside else None
+            made.append(Read(mean, sd, flags, wide, self._intervals(own, wide is not None)))
+        return made
 
     def _intervals(self, known: bool, wide: bool) -> str:
         """Which robots the intervals of a run hold for, in words."""
@@ -174,4 +165,4 @@ class NeuralMagnetometer(Summarized):
         return OWN if known else OTHERS if wide else ONLY_OWN
 
     def _summary(self) -> Summary:
-        return summary_of(self.net, f"NeuralMagnetometer {self.name}".rstrip())
+        return self.net.summary(f"NeuralMagnetometer {self.name}".rstrip())

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap, Outside
-from magtwin.learn.inference.calibrate import MOST_SD_M, labelled_drive, mixed_of_kind
+from magtwin.learn.inference.calibrate import check_pose_sd, labelled_drive, mixed_of_kind
 from magtwin.learn.inference.magnetometer import Read
 from magtwin.learn.inference.reader import Reader, Reading, Signals
+from magtwin.learn.mixed.effects import DELAY_S, MEMORY_S, FollowedEffects, followed
 from magtwin.learn.mixed.mixed import Mixed
-from magtwin.learn.mixed.session_effects import DELAY_S, MEMORY_S, FollowedEffects, followed
 from magtwin.learn.models.predictor import Predictor
 from magtwin.run.run import Run
 
@@ -103,13 +103,10 @@ class OnlineMagnetometer:
         row = self._reader.row(p_xy, yaw, signals, outside=outside)
         phi = self.model.regressors(row.x[None])
         mean, variance = self.effects.effects(t).predict(phi)
-        sd = self._factor * math.sqrt(float(self.model.noise_nt2(phi)[0]) + float(variance[0]))
+        factor = self.model.factors["online"] * self.effects.widening
+        sd = factor * math.sqrt(float(self.model.noise_nt2(phi)[0]) + float(variance[0]))
         beyond = bool(self.model.outside(row.x[None])[0])
         return Reading(row.b_map_nt + float(mean[0]), row.b_map_nt, float(mean[0]), sd, beyond)
-
-    @property
-    def _factor(self) -> float:
-        return self.model.factors["online"] * self.effects.widening
 
 
 def read_online(
@@ -148,9 +145,7 @@ def read_online(
 def _checked(model: Predictor, delay_s: float, memory_s: float, pose_sd_m: float) -> Mixed:
     if not 0 <= delay_s < math.inf:
         raise InputError(f"delay_s must be 0 or more and finite, got {delay_s!r}")
-    if not 0 <= pose_sd_m <= MOST_SD_M:
-        most = f", at most {MOST_SD_M:g} m" if pose_sd_m > MOST_SD_M else ""
-        raise InputError(f"pose_sd_m must be 0 or more and finite{most}, got {pose_sd_m!r}")
+    check_pose_sd(pose_sd_m)
     if not memory_s > 0:
         raise InputError(f"memory_s must be above 0, got {memory_s!r}")
     return mixed_of_kind(model)

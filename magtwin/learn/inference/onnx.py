@@ -91,9 +91,9 @@ def report_onnx(path: str | os.PathLike[str]) -> Report:
     onnx = _onnx()
     try:
         model = onnx.ModelProto.FromString(_without_graph(data, path))
-    except InputError:
-        raise
     except Exception as error:  # protobuf's own kinds of error
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path}: no ONNX file, or damaged; export it again") from error
     try:
         return _report(model, str(path))
@@ -104,21 +104,13 @@ def report_onnx(path: str | os.PathLike[str]) -> Report:
 
 
 def model_of(predictor: Predictor, *, weights_sha256: str = "") -> "onnx.ModelProto":
-    """The graph of a predictor, with its metadata.
-
-    Args:
-        predictor: Of any kind that a weights file holds.
-        weights_sha256: Checksum of its weights file, for the metadata.
-
-    Raises:
-        InputError: Another kind, or onnx is not installed.
-    """
+    """The graph of a predictor of magtwin's kinds, with its metadata."""
     onnx = _onnx()
     graph = _Graph(onnx)
     mean, sd = graph.predictor(predictor)
     graph.add("Identity", mean, out=MEAN)
     graph.add("Identity", sd, out=SD)
-    double, inputs = onnx.TensorProto.DOUBLE, inputs_of(predictor)
+    double, inputs = onnx.TensorProto.DOUBLE, predictor.inputs
     model = onnx.helper.make_model(
         onnx.helper.make_graph(
             graph.nodes,
@@ -151,17 +143,6 @@ def model_of(predictor: Predictor, *, weights_sha256: str = "") -> "onnx.ModelPr
         text = value if isinstance(value, str) else json.dumps(value, sort_keys=True, allow_nan=False)
         model.metadata_props.add(key=key, value=text)
     return model
-
-
-def inputs_of(predictor: Predictor) -> Inputs:
-    """Scaler and training ranges of a predictor's inputs.
-
-    Raises:
-        InputError: A kind that has no graph.
-    """
-    if isinstance(predictor, FieldNet | Linear | Hybrid | Mixed):
-        return predictor.inputs
-    raise InputError(f"a predictor of the kind {predictor.kind!r} has no ONNX graph")
 
 
 class _Graph:
@@ -229,18 +210,19 @@ class _Graph:
         nan = self.add("ReduceSum", self.add("Sub", z, z), self.constant(np.array([1])), keepdims=0)
         return self.add("Add", y, nan)
 
+    def affine(self, z: str, slopes: Any, constant: Any) -> str:
+        """Scaled inputs times slopes, and a constant, (rows,)."""
+        return self.add("Add", self.add("MatMul", z, self.constant(slopes)), self.constant(constant))
+
     def linear(self, linear: Linear, spread: Spread) -> tuple[str, str]:
         """Disturbance and standard deviation of a linear model, each (rows,)."""
         z = self.scaled(linear.inputs, INPUT)
-        mean = self.add("MatMul", z, self.constant(linear.coefficients_nt))
-        mean = self.add("Add", mean, self.constant(linear.constant_nt))
-        return mean, self.sd(spread, z)
+        return self.affine(z, linear.coefficients_nt, linear.constant_nt), self.sd(spread, z)
 
     def mixed(self, mixed: Mixed) -> tuple[str, str]:
         """Disturbance and standard deviation of a mixed model, each (rows,)."""
         z, effects = self.scaled(mixed.inputs, INPUT), mixed.session
-        mean = self.add("MatMul", z, self.constant(effects.mean[1:]))
-        mean = self.add("Add", mean, self.constant(effects.mean[0]))
+        mean = self.affine(z, effects.mean[1:], effects.mean[0])
         factor, share = mixed.interval_factors
         cross = self.add("MatMul", z, self.constant(effects.covariance[1:, 1:]))
         cross = self.add("Mul", self.add("Add", cross, self.constant(2 * effects.covariance[0, 1:])), z)
@@ -256,8 +238,7 @@ class _Graph:
 
     def variance(self, spread: Spread, z: str) -> str:
         """Variance of a spread at scaled inputs, (rows,)."""
-        variance = self.add("MatMul", self.add("Mul", z, z), self.constant(spread.slopes_nt2))
-        return self.add("Add", variance, self.constant(spread.floor_nt2))
+        return self.affine(self.add("Mul", z, z), spread.slopes_nt2, spread.floor_nt2)
 
 
 def _without_graph(data: bytes, where: object) -> bytes:
@@ -306,7 +287,7 @@ def _difference_nt(predictor: Predictor, data: bytes, weights: str | os.PathLike
         import onnxruntime
     except ImportError:
         raise InputError(EXTRA) from None
-    inputs = inputs_of(predictor)
+    inputs = predictor.inputs
     wave = np.sin(np.arange(PROBE * len(inputs.features), dtype=float)).reshape(PROBE, -1)
     x = inputs.mean + 2 * inputs.scale * wave
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])

@@ -273,7 +273,9 @@ def _compiled_path(predictor: Predictor, code: Any) -> PredictRow | None:
     if isinstance(predictor, Linear):
         return _linear(predictor, code, predictor.wide or predictor.spread)
     if isinstance(predictor, Hybrid):
-        return _hybrid(predictor, code)
+        base, net = predictor.base, predictor.net
+        residual = None if net is None else _net(net, code, clip=base.inputs)
+        return _linear(base, code, predictor.wide or base.spread.scaled(predictor.sd_factor), residual)
     return None
 
 
@@ -294,25 +296,17 @@ def _net(net: FieldNet, code: Any, clip: Inputs | None = None) -> PredictRow:
     return predict
 
 
-def _linear(linear: Linear, code: Any, spread: Spread) -> PredictRow:
+def _linear(linear: Linear, code: Any, spread: Spread, residual: PredictRow | None = None) -> PredictRow:
+    """A linear model, and the network for its residual."""
     ranges, z, scaled = _ranges(linear.inputs), np.empty(len(linear.features)), code.scaled
     constant, slopes = linear.constant_nt, linear.coefficients_nt
     floor, squares = spread.floor_nt2, spread.slopes_nt2
 
     def predict(x: Array) -> tuple[float, float, bool]:
         outside = scaled(x, ranges, z)
-        return constant + float(slopes @ z), math.sqrt(floor + float(squares @ (z * z))), outside
-
-    return predict
-
-
-def _hybrid(hybrid: Hybrid, code: Any) -> PredictRow:
-    base = _linear(hybrid.base, code, hybrid.wide or hybrid.base.spread.scaled(hybrid.sd_factor))
-    net = None if hybrid.net is None else _net(hybrid.net, code, clip=hybrid.base.inputs)
-
-    def predict(x: Array) -> tuple[float, float, bool]:
-        mean, sd, outside = base(x)
-        return mean + net(x)[0] if net else mean, sd, outside
+        mean = constant + float(slopes @ z)
+        mean = mean if residual is None else mean + residual(x)[0]
+        return mean, math.sqrt(floor + float(squares @ (z * z))), outside
 
     return predict
 

@@ -26,20 +26,9 @@ LEAST_ROBOTS = 4
 
 
 def widened(model: Predictor, recordings: Sequence[Source], field: AnomalyMap) -> Predictor:
-    """A model that knows its errors on robots that it was not trained on.
+    """A model that knows its errors on other robots: `magtwin.tasks.learning.widen` for a model and sources.
 
-    Args:
-        model: A model of any kind but a mixed one, which learns this in its training.
-        recordings: Recordings of other robots. A plant is a robot; recordings without one are told apart by
-            their sessions.
-        field: The map that the model was trained on.
-
-    Returns:
-        The model with `wide`; its predictions are unchanged.
-
-    Raises:
-        InputError: The model is a mixed one, the map is another, there are too few robots, or a recording has
-            no label on the map or lacks a column.
+    A plant is a robot; recordings without one are told apart by their sessions.
     """
     if model.kind == "mixed":
         raise InputError(

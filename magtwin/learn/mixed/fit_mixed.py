@@ -12,20 +12,22 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.learn.data.inputs import Array, inputs_of
 from magtwin.learn.data.recording import Rows
-from magtwin.learn.mixed.effects import Effects, Sums, fit_effects, sums_of
-from magtwin.learn.mixed.mixed import FACTORS, Mixed, mixed_of
-from magtwin.learn.mixed.session_effects import (
+from magtwin.learn.mixed.effects import (
     DELAY_S,
+    Effects,
     FollowedEffects,
+    Sums,
     effects_of_drive,
+    fit_effects,
     followed,
     shares,
+    sums_of,
     thinned_rows,
 )
+from magtwin.learn.mixed.mixed import FACTORS, Mixed, mixed_of
 from magtwin.learn.models.calibration import Spread, quantile_factor
 from magtwin.learn.models.linear import fit_linear
 from magtwin.learn.models.predictor import Fit, FitTask
-from magtwin.learn.models.weights import Weights
 
 DRIVE_S = 60.0
 """Length of the drive with which the factor of calibrated models is fitted [s]."""
@@ -45,12 +47,11 @@ class Mixeds:
 
     description = "A linear model whose coefficients differ between sessions (a mixed model)"
     options = MappingProxyType({"features": "session", "penalty": None, "weighting": "none"})
+    load = staticmethod(mixed_of)
 
     @staticmethod
     def fit(task: FitTask) -> Fit:
         """Fit mu to the nominal plant, Lambda and s^2 to all sessions, and factors to plants left out."""
-        if task.resume:
-            raise InputError("a mixed model is fitted at once; there is no checkpoint to resume from")
         if task.init is not None:
             raise InputError("a mixed model is fitted anew; leave out init")
         drives = list(_drives(task))
@@ -96,11 +97,6 @@ class Mixeds:
         model.factors = fitter.factors()
         return Fit(model)
 
-    @staticmethod
-    def load(weights: Weights) -> Mixed:
-        """The mixed model of a weights file."""
-        return mixed_of(weights)
-
 
 @dataclass(frozen=True)
 class _Drive:
@@ -139,9 +135,9 @@ class _Fitter:
         chosen = [i for i, drive in enumerate(self.drives) if drive.learned and i not in left]
         sums: list[Sums] = [self.sums[i] for i in chosen]
         start = np.full(len(self.model.prior.mean), self._start_nt2(chosen))
-        fitted = fit_effects(sums, self.model.prior.mean, start_nt2=start)
-        noise = self.model.noise.scaled(math.sqrt(fitted.factor))
-        return replace(self.model, prior=fitted.prior, session=fitted.prior, noise=noise)
+        prior, factor = fit_effects(sums, self.model.prior.mean, start_nt2=start)
+        noise = self.model.noise.scaled(math.sqrt(factor))
+        return replace(self.model, prior=prior, session=prior, noise=noise)
 
     def factors(self) -> dict[str, float]:
         """Factors of standard deviations, from sessions whose plant was left out of the fit."""

@@ -17,10 +17,9 @@ from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError
 from magtwin.learn.data.inputs import Array, inputs_from, scaler_tensors
-from magtwin.learn.mixed.effects import Effects
-from magtwin.learn.mixed.session_effects import effects_of_drive
+from magtwin.learn.mixed.effects import Effects, effects_of_drive
 from magtwin.learn.models.calibration import Spread, spread_from, spread_like
-from magtwin.learn.models.regressor import Regressor
+from magtwin.learn.models.predictor import Predictor
 from magtwin.learn.models.weights import Weights
 from magtwin.report.report import Figure
 
@@ -32,7 +31,7 @@ FACTORS = ("calibrated", "online")
 
 
 @dataclass(kw_only=True, repr=False)
-class Mixed(Regressor):
+class Mixed(Predictor):
     """A linear model with effects of the session, and the spread of its errors."""
 
     prior: Effects
@@ -176,16 +175,13 @@ class Mixed(Regressor):
 
     def figures(self) -> list[Figure]:
         """The constant, its spread between sessions, and the spreads of errors."""
-        about = {
-            "nominal": "of the nominal plant",
-            "unknown": "of any plant",
-            "calibrated": "of the session of its drive",
-        }
-        between = math.sqrt(float(self.prior.covariance[0, 0]))
-        constant, left = self.session.mean[0], math.sqrt(float(self.session.covariance[0, 0]))
+        (before, between), (constant, left) = (
+            (float(effects.mean[0]), math.sqrt(float(effects.covariance[0, 0])))
+            for effects in (self.prior, self.session)
+        )
         figures = [
-            Figure("intervals", self.intervals, note=about[self.intervals]),
-            Figure("constant", float(self.prior.mean[0]), "nT", between, "at the means; between sessions"),
+            Figure("intervals", self.intervals, note="the plants, or the session, that they hold for"),
+            Figure("constant", before, "nT", between, "at the means; between sessions"),
             Figure("sd within a session", self.noise.mean_nt, "nT", note="of training rows"),
             Figure("sd, nominal plant", self.spread.mean_nt, "nT", note="of training rows"),
             *(Figure(f"interval factor, {name}", self.factors[name]) for name in FACTORS),
@@ -193,7 +189,7 @@ class Mixed(Regressor):
         ]
         if self.intervals == "calibrated":
             figures[1:1] = [
-                Figure("constant of the session", float(constant), "nT", left),
+                Figure("constant of the session", constant, "nT", left),
                 Figure("interval factor of the drive", self.widening),
             ]
         return figures
@@ -243,6 +239,4 @@ def mixed_of(weights: Weights) -> Mixed:
         widening=weights.number("widening", above=0.0),
         families=int(weights.number("families", above=0.0)),
         penalty=weights.number("penalty"),
-        residual_sd_nt=weights.residual_sd_nt,
-        metadata=dict(weights.about["facts"]),
     )

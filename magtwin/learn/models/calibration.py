@@ -148,7 +148,7 @@ def few_groups_factor(error_nt: Array, groups: NDArray[np.intp]) -> float:
 
 
 def transferred_factor(
-    error_nt: Array, sd_nt: Array, groups: NDArray[np.intp], yardstick: "Yardstick"
+    error_nt: Array, sd_nt: Array, groups: NDArray[np.intp], yardstick: tuple[float, float]
 ) -> float:
     """Factor for a model that was compared with the validation recordings only.
 
@@ -159,29 +159,22 @@ def transferred_factor(
         error_nt: Errors on the validation rows [nT], shape (N,).
         sd_nt: Predicted standard deviations [nT], shape (N,).
         groups: Recording of each row, shape (N,).
-        yardstick: Factors of a linear model on the same recordings.
+        yardstick: Factors of a linear model on all recordings left out, and on those of validation.
     """
-    luck = yardstick.everywhere / yardstick.validation
+    luck = yardstick[0] / yardstick[1]
     return quantile_factor(error_nt, sd_nt, groups) * min(max(luck, 1 / MOST_FACTOR), MOST_FACTOR)
-
-
-@dataclass(frozen=True)
-class Yardstick:
-    """Factors of a linear model's standard deviations on recordings left out of its fit."""
-
-    everywhere: float
-    """On training (each group left out in turn) and validation, with `few_groups_factor`."""
-
-    validation: float
-    """On validation only."""
 
 
 def yardstick(
     error_nt: Array, sd_nt: Array, groups: NDArray[np.intp], validation: NDArray[np.bool_]
-) -> Yardstick:
-    """Yardstick from training and validation rows; `validation` marks the latter."""
+) -> tuple[float, float]:
+    """Factors of a linear model's standard deviations on recordings left out of its fit.
+
+    The first is for training (each group left out in turn) and validation, with `few_groups_factor`; the
+    second for validation only, whose rows `validation` marks.
+    """
     everywhere = quantile_factor(error_nt, sd_nt, groups) * few_groups_factor(error_nt, groups)
-    return Yardstick(everywhere, quantile_factor(error_nt[validation], sd_nt[validation], groups[validation]))
+    return everywhere, quantile_factor(error_nt[validation], sd_nt[validation], groups[validation])
 
 
 def _numbered(groups: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -1,7 +1,7 @@
 """Hybrid: a linear base, and a small network for its residual if that does better."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,13 +11,13 @@ from magtwin.errors import InputError
 from magtwin.learn.data.inputs import Array, Inputs
 from magtwin.learn.models.linear import Linear, like, linear_from
 from magtwin.learn.models.network import FieldNet, net_of
-from magtwin.learn.models.regressor import Regressor
+from magtwin.learn.models.predictor import Predictor
 from magtwin.learn.models.weights import Weights, tensors_below
 from magtwin.report.report import Figure
 
 
 @dataclass(kw_only=True, repr=False)
-class Hybrid(Regressor):
+class Hybrid(Predictor):
     """A disturbance y = base(x) + net(x clipped to the training ranges), or the base alone.
 
     Outside the training ranges the network keeps its value at their edge, while the base extrapolates
@@ -90,12 +90,10 @@ def hybrid_of(weights: Weights) -> Hybrid:
     extra = [name for name in weights.tensors if not name.startswith(("base.", "net."))]
     if extra:
         raise InputError(f"{weights.path}: tensor {extra[0]!r} belongs to no layer of a hybrid")
-    base = weights.with_tensors(parts["base"]).fit(like(len(weights.features)))
-    net = net_of(weights.with_tensors(parts["net"])) if parts["net"] else None
+    base = replace(weights, tensors=parts["base"]).fit(like(len(weights.features)))
+    net = net_of(replace(weights, tensors=parts["net"])) if parts["net"] else None
     return Hybrid(
         base=linear_from(weights, base),
         net=net,
         sd_factor=weights.number("sd_factor", above=0.0),
-        residual_sd_nt=weights.residual_sd_nt,
-        metadata=dict(weights.about["facts"]),
     )

@@ -7,7 +7,7 @@ form of Tolles and Lawson's compensation: hard iron varies with the heading, sof
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +23,7 @@ from magtwin.learn.models.calibration import (
     spread_from,
     spread_like,
 )
-from magtwin.learn.models.regressor import Regressor
+from magtwin.learn.models.predictor import Predictor
 from magtwin.learn.models.weights import Weights
 from magtwin.report.report import Figure
 
@@ -35,7 +35,7 @@ Weighting = Literal["auto", "label_sd", "none"]
 
 
 @dataclass(kw_only=True, repr=False)
-class Linear(Regressor):
+class Linear(Predictor):
     """A disturbance constant + sum_j c_j z_j with z = (x - mean) / scale, and the spread of its errors."""
 
     constant_nt: float
@@ -107,8 +107,7 @@ class Linear(Regressor):
         return [*figures, Figure("ridge penalty", self.penalty, note=note)]
 
 
-@dataclass(frozen=True)
-class FittedLinear:
+class FittedLinear(NamedTuple):
     """A linear model, and predictions of the rows by fits without them."""
 
     model: Linear
@@ -165,9 +164,9 @@ def fit_linear(
         inputs = start.inputs.grown(inputs)
     z = np.column_stack([inputs.scaled(x), np.ones(len(x))])
     towards = np.zeros(z.shape[1]) if start is None else np.append(start.coefficients_nt, start.constant_nt)
-    folds, groups = _folds(groups)
+    groups = np.unique(groups, return_inverse=True)[1].astype(np.intp)
     label_sd = np.zeros(len(y)) if sd is None else np.asarray(sd, float)
-    solve = _Ridge(z, y, folds, towards, penalty)
+    solve = _Ridge(z, y, groups % MOST_FOLDS, towards, penalty)
     best, weight = solve(np.ones(len(y))), None
     if weighting != "none" and label_sd.any():
         left = float(np.mean((best.held_out - y) ** 2))
@@ -176,7 +175,7 @@ def fit_linear(
         other = solve(weight)
         plain, weighted = (np.abs(each.held_out - y).mean() for each in (best, other))
         if weighting == "label_sd" or weighted < plain:
-            best = _Solved(other.beta, other.penalty, other.held_out, weighted=True)
+            best = other._replace(weighted=True)
     error = best.held_out - y
     spread = fit_spread(z[:, :-1], error)
     factor = quantile_factor(error, spread.sd_nt(z[:, :-1]), groups) * few_groups_factor(error, groups)
@@ -192,23 +191,12 @@ def fit_linear(
 
 
 def linear_of(weights: Weights) -> Linear:
-    """The linear model of a weights file.
-
-    Raises:
-        InputError: Its parts do not fit each other.
-    """
-    model = linear_from(weights, weights.fit(like(len(weights.features))))
-    model.residual_sd_nt = weights.residual_sd_nt
-    model.metadata = dict(weights.about["facts"])
-    return model
+    """The linear model of a weights file."""
+    return linear_from(weights, weights.fit(like(len(weights.features))))
 
 
 def linear_from(weights: Weights, tensors: Mapping[str, NDArray[Any]]) -> Linear:
-    """A linear model from tensors, with the settings of a weights file.
-
-    Raises:
-        InputError: A scale is not above 0, a variance is below 0, or a setting is missing.
-    """
+    """A linear model from tensors, with the settings of a weights file."""
     return Linear(
         inputs=inputs_from(weights.features, tensors, weights.path),
         constant_nt=float(tensors["constant_nt"]),
@@ -229,8 +217,7 @@ def like(count: int) -> dict[str, Array]:
     }
 
 
-@dataclass(frozen=True)
-class _Solved:
+class _Solved(NamedTuple):
     """Coefficients with the intercept last, and predictions by fits without each row's fold."""
 
     beta: Array
@@ -283,9 +270,3 @@ class _Ridge:
         ridge = np.full(len(curved), penalty * curved[-1, -1])
         ridge[-1] = 0.0
         return self.towards + np.linalg.lstsq(curved + np.diag(ridge), sloped, rcond=None)[0]
-
-
-def _folds(groups: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Fold of each row, and its group numbered from 0, each shape (N,)."""
-    numbers = np.unique(groups, return_inverse=True)[1].astype(np.intp)
-    return numbers % MOST_FOLDS, numbers

@@ -2,7 +2,6 @@
 
 import itertools
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,13 +15,13 @@ from magtwin.files.kinds import expected
 from magtwin.learn.data.features import FULL
 from magtwin.learn.data.inputs import Array, inputs_from, scaler_tensors
 from magtwin.learn.models.perceptron import Layer, outputs
-from magtwin.learn.models.regressor import Regressor
+from magtwin.learn.models.predictor import Predictor
 from magtwin.learn.models.weights import Weights, say
 from magtwin.report.report import Figure
 
 
 @dataclass(kw_only=True, repr=False)
-class FieldNet(Regressor):
+class FieldNet(Predictor):
     """Disturbance of the field magnitude [nT] from features of a Run, (N, F) -> (N,).
 
     A multilayer perceptron between two scalers:
@@ -141,19 +140,6 @@ def net_of_checkpoint(path: str | os.PathLike[str]) -> FieldNet:
     return net_of(Weights(path, "mlp", about, tensors))
 
 
-def check_shape(hidden: Sequence[int], dropout: float) -> None:
-    """Refuse a network without hidden layers, or with a share of dropout that is none.
-
-    Raises:
-        InputError: It is refused.
-    """
-    if not hidden or not all(width > 0 for width in hidden) or not 0 <= dropout < 1:
-        raise InputError(
-            f"a network needs hidden layers above 0 wide and dropout in 0..1, "
-            f"got {tuple(hidden)} and {dropout}"
-        )
-
-
 def net_of(weights: Weights) -> FieldNet:
     """The network of a weights file.
 
@@ -174,10 +160,10 @@ def net_of(weights: Weights) -> FieldNet:
                 f"{path}: tensor 'layers.{i}.weight' is {say(weight)}; a layer's have shape (out, in)"
             )
     hidden = [len(weight) for weight in held[:-1]]
-    try:
-        check_shape(hidden, dropout)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
+    if not all(hidden) or not 0 <= dropout < 1:
+        raise InputError(
+            f"{path}: a network needs hidden layers above 0 wide and dropout in 0..1, got {hidden}, {dropout}"
+        )
     widths = [len(weights.features), *hidden, 1]
     one = np.ones((), np.float32)  # broadcast takes no memory before the shapes are checked
     like = scaler_tensors(len(weights.features)) | {"y_mean": np.ones(()), "y_scale": np.ones(())}

@@ -49,14 +49,8 @@ def threads_of_products() -> int:
 def in_threads(work: Callable[[], None], threads: int) -> None:
     """Run `work` in several threads, each with products in one thread.
 
-    All cores then stay busy between products, which the threads of a product leave idle.
-
-    Args:
-        work: Takes items from a shared supply until none is left.
-        threads: Number of threads; with 1 or fewer, `work` runs in the calling thread.
-
-    Raises:
-        BaseException: An exception of a thread, after all threads have ended.
+    All cores then stay busy between products, which the threads of a product leave idle. `work` takes items
+    from a shared supply until none is left. Its first exception is raised after all threads have ended.
     """
     with _blas().limit(limits=1):
         if threads <= 1:

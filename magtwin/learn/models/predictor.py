@@ -1,7 +1,7 @@
 """Predictors: models of the disturbance that a robot adds to the map, and the registry of their kinds.
 
-To add a kind, write a `Predictor` (subclass `magtwin.learn.models.regressor.Regressor`) and a
-`PredictorKind`, and register the latter under the predictor's `kind`:
+To add a kind, write a subclass of `Predictor` and a `PredictorKind`, and register the latter under the
+predictor's `kind`:
 
     @PREDICTORS.register("forest")
     class ForestKind:
@@ -18,75 +18,146 @@ A package registers it by an entry point of the group `magtwin.predictors`. Then
 forest` trains it, and every command reads its weights.
 """
 
+import math
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.extend import Registry
-from magtwin.learn.data.inputs import Inputs
+from magtwin.learn.data.inputs import Array, Inputs
 from magtwin.learn.data.recording import Recording, Rows
 from magtwin.learn.models.calibration import Spread
-from magtwin.learn.models.network import net_of_checkpoint
-from magtwin.learn.models.weights import MetadataValue, Weights, is_checkpoint, read_weights
-from magtwin.report.report import Report
+from magtwin.learn.models.weights import (
+    MetadataValue,
+    Weights,
+    is_checkpoint,
+    read_weights,
+    shown,
+    write_weights,
+)
+from magtwin.report.report import Figure, Report
+from magtwin.report.summary import Summarized, Summary, listed
 
-Array = NDArray[np.float64]
 
+@dataclass(kw_only=True, repr=False)
+class Predictor(Summarized, ABC):
+    """Predicts a disturbance and its standard deviation, row by row. It is saved as tensors and settings."""
 
-class Predictor(Protocol):
-    """Predicts a disturbance and its standard deviation, row by row."""
+    inputs: Inputs
+    """Names, scaler and training ranges of the inputs."""
 
-    metadata: dict[str, MetadataValue]
-    """Provenance: what it was trained on."""
-
-    residual_sd_nt: float
+    residual_sd_nt: float = math.nan
     """Root mean square error on held-out recordings [nT]; nan if unknown."""
 
-    wide: Spread | None
+    metadata: dict[str, MetadataValue] = field(default_factory=dict)
+    """Provenance: what it was trained on."""
+
+    wide: Spread | None = None
     """Spread of errors on robots that it was not trained on; None if it was never learned."""
 
-    @property
-    def features(self) -> tuple[str, ...]:
-        """Names of the inputs, in order."""
+    kind: ClassVar[str]
+    """Name of its kind in `PREDICTORS`."""
 
     @property
-    def inputs(self) -> Inputs:
-        """Scaler and training ranges of the inputs."""
-
-    @property
-    def kind(self) -> str:
-        """Name of its kind in `PREDICTORS`."""
-
-    @property
+    @abstractmethod
     def layers_text(self) -> str:
         """Its shape in words, as 20-512-1."""
 
     @property
+    @abstractmethod
     def parameters_count(self) -> int:
         """Number of fitted parameters."""
 
+    @abstractmethod
     def predict(self, x: ArrayLike) -> tuple[Array, Array]:
         """Disturbances and standard deviations of their errors [nT], each (N,), from features (N, F)."""
+
+    @abstractmethod
+    def tensors(self) -> dict[str, NDArray[Any]]:
+        """Arrays to save, by name."""
+
+    @abstractmethod
+    def settings(self) -> dict[str, Any]:
+        """Other values to save, as JSON."""
+
+    @abstractmethod
+    def figures(self) -> list[Figure]:
+        """Its parts, for the report."""
+
+    @property
+    def features(self) -> tuple[str, ...]:
+        """Names of the inputs, in order."""
+        return self.inputs.features
+
+    @property
+    def judged_on(self) -> str:
+        """What `residual_sd_nt` was measured on."""
+        return "held-out recordings"
+
+    def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
+        """Whether an input of a row left the range of the training rows; see `Inputs.outside`."""
+        return self.inputs.outside(x)
 
     def wide_sd_nt(self, x: ArrayLike) -> Array | None:
         """Standard deviations on robots that it was not trained on [nT], (N,), from features (N, F), or None.
 
         None if it learned none, or predicts for the session of a drive.
         """
-
-    def outside(self, x: ArrayLike) -> NDArray[np.bool_]:
-        """Whether an input of a row left the range of the training rows, shape (N,)."""
+        return None if self.wide is None else self.wide.sd_nt(self.inputs.scaled(self.inputs.checked(x)))
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Write it to one safetensors file; the same predictor gives the same bytes."""
+        """Write it to a safetensors file; the same model gives the same bytes.
+
+        Raises:
+            InputError: The file exists and `force` was not given.
+        """
+        write_weights(
+            path,
+            self.kind,
+            self.tensors(),
+            features=self.features,
+            residual_sd_nt=self.residual_sd_nt,
+            metadata=self.metadata,
+            wide=self.wide,
+            force=force,
+            **self.settings(),
+        )
 
     def report(self, title: str) -> Report:
-        """Its kind, shape and errors."""
+        """Its kind, its parts, and its error on held-out recordings if known."""
+        figures = [Figure("kind", self.kind), *self.figures()]
+        if self.wide is not None:
+            note = "of training rows, on robots that it was not trained on"
+            figures.append(Figure("sd, other robots", self.wide.mean_nt, "nT", note=note))
+        if not math.isnan(self.residual_sd_nt):
+            figures.append(Figure("residual sd", self.residual_sd_nt, "nT", note=f"on {self.judged_on}"))
+        return Report(title, tuple(figures), shown(self.metadata))
+
+    def summary(self, title: str) -> Summary:
+        """Kind, layers, inputs, error and provenance under a title."""
+        known = ("dataset", "map", "created", "licence", "source")
+        trained = [f"{name} {self.metadata[name]}" for name in known if name in self.metadata]
+        error = f"{self.residual_sd_nt:.4g} nT rms on {self.judged_on}"
+        return Summary(
+            f"{title}: {self.kind}, {self.parameters_count:,} parameters",
+            (
+                ("layers", self.layers_text),
+                ("inputs", f"{len(self.features)}: {listed(self.features)}"),
+                ("error", "unknown" if math.isnan(self.residual_sd_nt) else error),
+                ("metadata", ", ".join(trained) or listed(tuple(self.metadata))),
+            ),
+            ("fact", "value"),
+            [(name, str(value)) for name, value in self.metadata.items()],
+        )
+
+    def _summary(self) -> Summary:
+        return self.summary(type(self).__name__)
 
 
 @dataclass(frozen=True)
@@ -102,35 +173,8 @@ class Epoch:
     val_rmse_nt: float
     """RMSE on the validation rows, without dropout [nT]."""
 
-    val_mae_nt: float
-    """Mean absolute error on the validation rows [nT]."""
-
     best: bool
     """Whether no earlier epoch has a smaller val_rmse_nt; the last such epoch is kept."""
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Whether a hybrid keeps its network, by mean absolute errors on the validation rows [nT]."""
-
-    base_mae_nt: float
-    """Of the base alone."""
-
-    whole_mae_nt: float
-    """Of base and network."""
-
-    @property
-    def kept(self) -> bool:
-        """Whether the network lowers the error."""
-        return self.whole_mae_nt < self.base_mae_nt
-
-    def text(self) -> str:
-        """The decision and its reason, in a sentence."""
-        decision = "is kept" if self.kept else "is left out, the base alone remains"
-        return (
-            f"on the validation recordings the base alone errs by {self.base_mae_nt:.1f} nT, with the "
-            f"network by {self.whole_mae_nt:.1f} nT: the network {decision}"
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,17 +208,8 @@ class FitTask:
     init: Any = None
     """Predictor of the same kind to continue from, or None."""
 
-    freeze: tuple[str, ...] = ()
-    """Layers that stay as in `init`."""
-
     device: str = "cpu"
     """Where torch trains."""
-
-    checkpoint: str | os.PathLike[str] | None = None
-    """File for the state after each epoch."""
-
-    resume: bool = False
-    """Whether to continue from `checkpoint`."""
 
     progress: Callable[[Epoch], None] | None = None
     """Called after each epoch."""
@@ -191,9 +226,6 @@ class Fit:
 
     history: tuple[Epoch, ...] = ()
     """Its epochs; empty if it is fitted at once."""
-
-    choice: Choice | None = None
-    """Of a hybrid."""
 
     held_out_nt: Array | None = None
     """Disturbance at each training row by a fit without its group [nT], shape (N,); of a hybrid, by its base.
@@ -247,6 +279,8 @@ def load_predictor(path: str | os.PathLike[str]) -> Predictor:
         InputError: Neither of the two, damaged, or its parts do not fit each other.
     """
     if is_checkpoint(path):
+        from magtwin.learn.models.network import net_of_checkpoint
+
         return net_of_checkpoint(path)
     weights = read_weights(path)
     try:
@@ -254,6 +288,6 @@ def load_predictor(path: str | os.PathLike[str]) -> Predictor:
     except InputError as error:
         raise InputError(f"{path}: {error}; update magtwin, or install the package of this kind") from error
     predictor = kind.load(weights)
-    if weights.wide is not None:
-        predictor.wide = weights.wide
+    predictor.residual_sd_nt, predictor.metadata = weights.residual_sd_nt, dict(weights.about["facts"])
+    predictor.wide = weights.wide
     return predictor

@@ -65,10 +65,6 @@ class Weights:
         sd = self.about["residual_sd_nt"]
         return math.nan if sd is None else sd
 
-    def with_tensors(self, tensors: Tensors) -> "Weights":
-        """The same file with some of its tensors, renamed."""
-        return replace(self, tensors=tensors)
-
     def expect(self, key: str, kind: Any) -> Any:
         """A setting of the file.
 
@@ -92,12 +88,8 @@ class Weights:
             raise InputError(f"{self.path}: {key!r} of its metadata must be {wanted}, got {str(value)[:40]}")
         return float(value)
 
-    def fit(self, like: Tensors, *, unknown: Sequence[str] = ("x_min", "x_max")) -> dict[str, NDArray[Any]]:
-        """The tensors, checked against others.
-
-        Args:
-            like: Tensors of the required names, shapes and types.
-            unknown: Names of tensors that may hold nan.
+    def fit(self, like: Tensors) -> dict[str, NDArray[Any]]:
+        """The tensors, checked against others of the required names, shapes and types.
 
         Raises:
             InputError: A tensor is missing, unknown, of another shape or type, or not finite.
@@ -111,7 +103,7 @@ class Weights:
                     f"{self.path}: tensor {name!r} is {say(tensor)}, the {len(self.features)} features and "
                     f"the other layers ask for {say(wanted)}"
                 )
-            if name not in unknown and not bool(np.isfinite(tensor).all()):
+            if name not in ("x_min", "x_max") and not bool(np.isfinite(tensor).all()):
                 raise InputError(f"{self.path}: tensor {name!r} has numbers that are nan or infinite")
         if extra := sorted(set(self.tensors) - set(like)):
             noun = "FieldNet" if self.kind == "mlp" else self.kind
@@ -141,26 +133,11 @@ def write_weights(
     features: Sequence[str],
     residual_sd_nt: float,
     metadata: Mapping[str, MetadataValue],
-    wide: Spread | None = None,
-    force: bool = False,
+    wide: Spread | None,
+    force: bool,
     **about: Any,
 ) -> None:
-    """Write a predictor to a safetensors file; the same predictor gives the same bytes.
-
-    Args:
-        path: The file.
-        kind: Kind of the predictor.
-        tensors: Tensors by name.
-        features: Names of the inputs, in order.
-        residual_sd_nt: Root mean square error on held-out recordings [nT]; nan if unknown.
-        metadata: Provenance.
-        wide: Spread of errors on robots that it was not trained on; None if it was never learned.
-        force: Replace an existing file.
-        about: Settings of the kind, as JSON.
-
-    Raises:
-        InputError: The file exists and `force` was not given.
-    """
+    """Write the parts of a `Predictor`, and the settings of its kind, to a safetensors file."""
     header = {
         "format_version": VERSIONS.get(kind, VERSION),
         "features": features,
@@ -203,7 +180,7 @@ def read_weights(path: str | os.PathLike[str]) -> Weights:
     own = {name: tensors.pop(name) for name in like if name in tensors}
     if not own:
         return weights
-    return replace(weights, wide=spread_from(weights.with_tensors(own).fit(like), WIDE, path))
+    return replace(weights, wide=spread_from(replace(weights, tensors=own).fit(like), WIDE, path))
 
 
 def _about(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:

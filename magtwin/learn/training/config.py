@@ -20,22 +20,30 @@ from magtwin.learn.models.predictor import PREDICTORS
 
 Device = Literal["cpu", "cuda", "auto"]
 
-PRESETS: Mapping[str, tuple[str, Mapping[str, Any]]] = MappingProxyType(
-    {
-        "paper": ("mlp", {}),
-        "released": ("mlp", {"layers": (512, 512, 512, 128)}),
-    }
-)
-"""Models that are a kind of predictor with other defaults; all other models are named by their kind."""
+PAPER = "paper"
+"""Name of the kind "mlp" as a model; all other models are named by their kind."""
 
 MOST_WEIGHTS = 100_000_000  # Largest network; with gradients and Adam's moments it takes 1.6 GB
-MOST = {"epochs": 100_000, "threads": 1024, "batch": 1_000_000_000}
+BOUNDS: Mapping[str, tuple[float, float]] = MappingProxyType(
+    {
+        "epochs": (1, 100_000),
+        "batch": (1, 1_000_000_000),
+        "lr": (1e-12, 1e3),
+        "patience": (1, 100_000),
+        "threads": (1, 1024),
+        "penalty": (0, 1e12),
+        "dropout": (0, 0.999),
+        "seed": (0, math.inf),
+    }
+)
+"""Least and largest value of each number."""
+
 COMMON = ("model", "seed", "split", "hold_out", "init", "licence")  # Options that every model reads
 
 
 def models() -> list[str]:
     """Names of all models, those of installed packages included."""
-    return [*PRESETS, *(kind for kind in PREDICTORS if kind not in {of for of, _ in PRESETS.values()})]
+    return [PAPER, *(kind for kind in PREDICTORS if kind != "mlp")]
 
 
 def options_of(model: str) -> dict[str, Any]:
@@ -45,8 +53,7 @@ def options_of(model: str) -> dict[str, Any]:
         InputError: No such model.
     """
     find("model", model, dict.fromkeys(models()))
-    kind, changed = PRESETS.get(model, (model, {}))
-    return {**PREDICTORS[kind].options, **changed}
+    return dict(PREDICTORS["mlp" if model == PAPER else model].options)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,9 +65,9 @@ class TrainConfig:
     """
 
     model: str = "paper"
-    """The model: "paper" or "released" (multilayer perceptrons of the paper's or the released shape),
-    "linear" (Tolles-Lawson by ridge regression), "hybrid", "mixed" (coefficients that differ between
-    sessions), or a kind of `magtwin.learn.models.predictor.PREDICTORS`."""
+    """The model: "paper" (multilayer perceptron), "linear" (Tolles-Lawson by ridge regression), "hybrid",
+    "mixed" (coefficients that differ between sessions), or another kind of
+    `magtwin.learn.models.predictor.PREDICTORS`."""
 
     layers: tuple[int, ...] = ()
     """Widths of the hidden layers."""
@@ -112,9 +119,6 @@ class TrainConfig:
     licence: str = ""
     """Licence of the weights, an SPDX identifier such as MIT."""
 
-    freeze: tuple[str, ...] = ()
-    """Layers that stay as in `init`: "layers.0" is the first; for a hybrid also "base"."""
-
     def __post_init__(self) -> None:
         known = options_of(self.model)
         for field in fields(self):
@@ -131,38 +135,22 @@ class TrainConfig:
         self._check()
 
     def _check(self) -> None:
-        inputs = self.inputs  # refuses unknown features
-        for name in ("epochs", "batch", "lr"):
+        for name, (least, most) in BOUNDS.items():
             value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise InputError(f"{name} must be above 0, got {value!r}")
-        for name, count in (("patience", self.patience), ("threads", self.threads)):
-            if count is not None and count < 1:
-                raise InputError(f"{name} must be 1 at least, got {count!r}; leave it out for none")
-        for name, most in MOST.items():
-            if (getattr(self, name) or 0) > most:
-                raise InputError(f"{name} must be at most {most:,}, got {getattr(self, name):,}")
-        if self.penalty is not None and not 0 <= self.penalty < math.inf:
-            raise InputError(f"penalty must be 0 or more and finite, got {self.penalty!r}")
-        if self.dropout is not None and not 0 <= self.dropout < 1:
-            raise InputError(f"dropout must be at least 0 and below 1, got {self.dropout!r}")
-        if self.seed < 0:
-            raise InputError(f"seed must be 0 or more, got {self.seed!r}")
-        if not all(width > 0 for width in self.layers) or not inputs:
+            if value is not None and not least <= value <= most:
+                raise InputError(f"{name} must be between {least:,} and {most:,}, got {value!r}")
+        if not all(width > 0 for width in self.layers):
             raise InputError(f"layers must be above 0 wide, got {self.layers!r}")
-        weights = sum(a * b for a, b in itertools.pairwise((len(inputs), *self.layers, 1)))
+        weights = sum(a * b for a, b in itertools.pairwise((len(self.inputs), *self.layers, 1)))
         if weights > MOST_WEIGHTS:
             raise InputError(
-                f"layers {self.layers!r} make {weights:,} weights; take {MOST_WEIGHTS:,} at most",
-                parameter="layers",
+                f"layers must be narrower: {self.layers!r} make {weights:,} weights, at most {MOST_WEIGHTS:,}"
             )
-        if self.freeze and self.init is None:
-            raise InputError("freeze keeps layers of trained weights: give init too")
 
     @property
     def kind(self) -> str:
         """Kind of the predictor, a name of `PREDICTORS`."""
-        return PRESETS.get(self.model, (self.model, {}))[0]
+        return "mlp" if self.model == PAPER else self.model
 
     @property
     def inputs(self) -> tuple[str, ...]:

@@ -7,15 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from magtwin.errors import InputError, find
-from magtwin.learn.models.calibration import Yardstick, transferred_factor, yardstick
+from magtwin.learn.models.calibration import transferred_factor, yardstick
 from magtwin.learn.models.hybrid import Hybrid, hybrid_of
 from magtwin.learn.models.linear import FittedLinear, Linear, fit_linear, linear_of
 from magtwin.learn.models.network import FieldNet, net_of
-from magtwin.learn.models.predictor import Array, Choice, Epoch, Fit, FitTask
+from magtwin.learn.models.predictor import Array, Epoch, Fit, FitTask
 
 DESCENT: Mapping[str, Any] = MappingProxyType({"epochs": 20, "batch": 1024, "lr": 1e-3, "patience": None})
-TORCH: Mapping[str, Any] = MappingProxyType({"threads": None, "device": "auto", "freeze": ()})
+TORCH: Mapping[str, Any] = MappingProxyType({"threads": None, "device": "auto"})
 RIDGE: Mapping[str, Any] = MappingProxyType({"penalty": None, "weighting": "auto"})
 
 
@@ -32,10 +31,7 @@ class Perceptrons:
     def fit(task: FitTask) -> Fit:
         """Fit by Adam; the best epoch on the validation rows is kept."""
         learned, stops = task.train, task.validation
-        net, history = _train(
-            task, learned.x, learned.y, stops.x, stops.y, init=task.init, freeze=task.freeze
-        )
-        return Fit(net, history)
+        return Fit(*_train(task, learned.x, learned.y, stops.x, stops.y, init=task.init))
 
 
 class Linears:
@@ -48,11 +44,9 @@ class Linears:
     @staticmethod
     def fit(task: FitTask) -> Fit:
         """Fit by ridge regression and calibrate the spread."""
-        if task.resume:
-            raise InputError("a linear model is fitted at once; there is no checkpoint to resume from")
         fitted = _ridge(task, task.init)
         model = fitted.model
-        scale = _yardstick(task, fitted, *model.predict(task.validation.x)).everywhere
+        scale = _yardstick(task, fitted, *model.predict(task.validation.x))[0]
         model = replace(model, spread=model.spread.scaled(scale))
         return Fit(model, held_out_nt=_left_out(fitted))
 
@@ -70,17 +64,11 @@ class Hybrids:
     def fit(task: FitTask) -> Fit:
         """Fit the base, then the network to what the base leaves."""
         learned, stops, init = task.train, task.validation, task.init
-        known = {"base", *(f"layers.{i}" for i in range(len(init.net.layers) if init and init.net else 0))}
-        for name in task.freeze:
-            find("layer", name, dict.fromkeys(sorted(known)))
-        if "base" in task.freeze:
-            base = FittedLinear(init.base, init.base.predict(learned.x)[0], task.train_groups)
-        else:
-            base = _ridge(task, None if init is None else init.base)
+        base = _ridge(task, None if init is None else init.base)
         inputs = base.model.inputs
         residual = learned.y - base.model.predict(learned.x)[0]
         base_mean, base_sd = base.model.predict(stops.x)
-        model, choice = Hybrid(base=base.model, net=None), None
+        model = Hybrid(base=base.model, net=None)
         history: tuple[Epoch, ...] = ()
         if residual.std() > 1e-9:
             net, history = _train(
@@ -91,16 +79,21 @@ class Hybrids:
                 stops.y - base_mean,
                 weight=base.weight,
                 init=None if init is None else init.net,
-                freeze=[name for name in task.freeze if name != "base"],
             )
             whole = Hybrid(base=base.model, net=net)
-            errors = (base_mean - stops.y, whole.predict(stops.x)[0] - stops.y)
-            choice = Choice(*(float(np.mean(np.abs(error))) for error in errors))
-            model = whole if choice.kept else model
+            predictions = (base_mean, whole.predict(stops.x)[0])
+            of_base, of_whole = (float(np.mean(np.abs(mean - stops.y))) for mean in predictions)
+            kept = of_whole < of_base
+            model = whole if kept else model
+            model.metadata = {
+                "network": "kept" if kept else "left out",
+                "base_validation_mae_nt": of_base,
+                "whole_validation_mae_nt": of_whole,
+            }
         error = model.predict(stops.x)[0] - stops.y
         reference = _yardstick(task, base, base_mean, base_sd)
         model.sd_factor = transferred_factor(error, base_sd, task.validation_groups, reference)
-        return Fit(model, history, choice, _left_out(base) if "base" not in task.freeze else None)
+        return Fit(model, history, _left_out(base))
 
 
 def _train(
@@ -117,8 +110,6 @@ def _train(
         rng=task.rng,
         features=task.features,
         device=task.device,
-        checkpoint=task.checkpoint,
-        resume=task.resume,
         progress=task.progress,
         advance=task.advance,
         **{name: task.options[name] for name in names},
@@ -139,7 +130,7 @@ def _ridge(task: FitTask, start: Linear | None) -> FittedLinear:
     )
 
 
-def _yardstick(task: FitTask, fitted: FittedLinear, mean_nt: Array, sd_nt: Array) -> Yardstick:
+def _yardstick(task: FitTask, fitted: FittedLinear, mean_nt: Array, sd_nt: Array) -> tuple[float, float]:
     """How well the standard deviations of a linear model held on unseen recordings."""
     learned, stops = task.train, task.validation
     error = np.concatenate([fitted.held_out_nt - learned.y, mean_nt - stops.y])

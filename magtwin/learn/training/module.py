@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from magtwin.learn.data.inputs import SCALERS, Inputs
-from magtwin.learn.models.network import FieldNet, check_shape
+from magtwin.learn.models.network import FieldNet
 from magtwin.learn.models.perceptron import Layer
 
 
@@ -34,17 +34,8 @@ class NetModule(torch.nn.Module):
         y_mean: float = 0.0,
         y_scale: float = 1.0,
     ) -> None:
-        """Make a module with random weights.
-
-        Args:
-            inputs: Names, scaler and ranges of the inputs.
-            hidden: Widths of the hidden layers.
-            dropout: Share of units dropped in training.
-            y_mean: Mean of the labels [nT].
-            y_scale: Scale of the labels [nT], above 0.
-        """
+        """Make a module with random weights; the arguments are those of a `FieldNet`."""
         super().__init__()
-        check_shape(hidden, dropout)
         self.features, self.dropout = inputs.features, dropout
         widths = [len(inputs.features), *hidden, 1]
         self.layers = torch.nn.ModuleList(torch.nn.Linear(a, b) for a, b in itertools.pairwise(widths))

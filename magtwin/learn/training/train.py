@@ -4,7 +4,6 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +14,19 @@ from threadpoolctl import threadpool_limits
 
 from magtwin.errors import InputError
 from magtwin.files.file import sha256
-from magtwin.files.outputs import afterwards, check_free, output, transaction
+from magtwin.files.outputs import check_free, output, transaction
 from magtwin.learn.data.dataset import MANIFEST, Dataset, open_dataset
+from magtwin.learn.data.features import CIRCULAR, FEATURES
 from magtwin.learn.data.origin import NOMINAL, ROBOT_METADATA
+from magtwin.learn.data.recording import Rows
 from magtwin.learn.data.residuals import HeldOut, held_out_errors, residuals
 from magtwin.learn.data.split import PARTS, Part, Split
 from magtwin.learn.data.split import split as split_recordings
+from magtwin.learn.models.linear import fit_linear
 from magtwin.learn.models.predictor import PREDICTORS, Epoch, Fit, FitTask, Predictor, load_predictor
 from magtwin.learn.models.weights import MetadataValue
 from magtwin.learn.training.config import TrainConfig
-from magtwin.learn.training.model_card import model_card
-from magtwin.learn.training.result import PartErrors, TrainingResult
-from magtwin.learn.training.training_data import TrainingData, read_training_data
+from magtwin.learn.training.result import PartErrors, TrainingResult, model_card
 from magtwin.report.verdict import SEPARATOR, coverage, recordings_text
 from magtwin.version import __version__
 
@@ -38,6 +38,9 @@ ORIGIN = (
 )
 """Metadata of a data set that weights keep."""
 
+RowsOf = Mapping[Part, Rows]
+Groups = Mapping[Part, NDArray[np.intp]]
+
 
 def train(
     dataset: Dataset | str | os.PathLike[str],
@@ -45,7 +48,6 @@ def train(
     out: str | os.PathLike[str] | None = None,
     config: TrainConfig | None = None,
     force: bool = False,
-    resume: bool = False,
     progress: Callable[[Epoch], None] | None = None,
     advance: Callable[[int, int], None] | None = None,
     **options: Any,
@@ -54,11 +56,9 @@ def train(
 
     Args:
         dataset: Labelled recordings, or the folder of a data set.
-        out: Weights file to write, .safetensors. The model card is written beside it as .md. After each epoch
-            the state is written to .checkpoint, which is removed at the end.
+        out: Weights file to write, .safetensors. The model card is written beside it as .md.
         config: Model and options. Default: the paper's network.
         force: Replace existing files.
-        resume: Continue from the checkpoint beside `out`; the weights are those of an uninterrupted training.
         progress: Called after each epoch.
         advance: Called after each step with the rows done and the rows of all epochs.
         **options: Fields of `TrainConfig`, such as model="hybrid" or seed=3. They override `config`.
@@ -68,30 +68,14 @@ def train(
             not fit the model, or a file exists.
     """
     config = (config or TrainConfig()).with_options(**options)
-    checkpoint = None
-    if out is not None:
-        out = Path(out)
-        checkpoint = out.with_suffix(".checkpoint")
-        for path in (out, out.with_suffix(".md")):
-            check_free(path, force=force)
-        if checkpoint.exists() and not (resume or force):
-            raise InputError(
-                f"{checkpoint}: an unfinished training; resume it (--resume), or replace it (--force)"
-            )
+    for path in () if out is None else (Path(out), Path(out).with_suffix(".md")):
+        check_free(path, force=force)
     dataset = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
     deals, draws = np.random.default_rng(config.seed).spawn(2)
     parts = split_recordings(dataset.recordings, config.split, hold_out=config.hold_out, rng=deals)
-    result = fit(
-        config,
-        dataset,
-        parts,
-        rng=draws,
-        checkpoint=checkpoint,
-        resume=resume,
-        progress=progress,
-        advance=advance,
-    )
-    if out is not None and checkpoint is not None:
+    result = fit(config, dataset, parts, rng=draws, progress=progress, advance=advance)
+    if out is not None:
+        out = Path(out)
         with (
             transaction(),
             output(out, force=force) as weights,
@@ -99,7 +83,6 @@ def train(
         ):
             result.predictor.save(weights)
             card.write_text(model_card(result, out.name, sha256(weights)), encoding="utf-8")
-        afterwards(partial(checkpoint.unlink, missing_ok=True))
     return result
 
 
@@ -109,34 +92,18 @@ def fit(
     split: Split,
     *,
     rng: np.random.Generator,
-    checkpoint: Path | None = None,
-    resume: bool = False,
     progress: Callable[[Epoch], None] | None = None,
     advance: Callable[[int, int], None] | None = None,
 ) -> TrainingResult:
     """Train on one part of a data set, stop and calibrate by another, judge by the third.
 
-    Args:
-        config: Model and options; its `seed`, `split` and `hold_out` are not read.
-        dataset: Labelled recordings.
-        split: Recordings of training, validation and test.
-        rng: Source of the initial weights, the order of rows and dropout.
-        checkpoint: File for the state after each epoch.
-        resume: Continue from `checkpoint`.
-        progress: Called after each epoch.
-        advance: Called after each step with the rows done and the rows of all epochs.
-
-    Raises:
-        InputError: A part has no rows, the data set lacks a column of a feature, or the model cannot be
-            fitted.
+    Of `config`, `seed`, `split` and `hold_out` are not read; `rng` draws initial weights, order and dropout.
     """
     threads, before = config.threads or 1, torch.get_num_threads()
     with threadpool_limits(threads):  # the products of numpy and scipy
         torch.set_num_threads(threads)
         try:
-            return _fit(
-                config, dataset, split, rng, checkpoint, resume=resume, progress=progress, advance=advance
-            )
+            return _fit(config, dataset, split, rng, progress, advance)
         finally:
             torch.set_num_threads(before)
 
@@ -146,14 +113,11 @@ def _fit(
     dataset: Dataset,
     split: Split,
     rng: np.random.Generator,
-    checkpoint: Path | None,
-    *,
-    resume: bool,
     progress: Callable[[Epoch], None] | None,
     advance: Callable[[int, int], None] | None,
 ) -> TrainingResult:
     """As `fit`, with threads set."""
-    data = read_training_data(dataset, split, config.inputs)
+    rows, groups = _read(dataset, split, config.inputs)
     init = None if config.init is None else load_predictor(config.init)
     if init is not None and init.kind != config.kind:
         raise InputError(
@@ -161,113 +125,133 @@ def _fit(
             f"another file, or train with --model {'paper' if init.kind == 'mlp' else init.kind}"
         )
     device = device_of(config)
+    recordings = {recording.name: recording for recording in dataset.recordings}
     task = FitTask(
         features=config.inputs,
-        train=data.rows["train"],
-        validation=data.rows["validation"],
-        train_groups=data.groups["train"],
-        validation_groups=data.groups["validation"],
+        train=rows["train"],
+        validation=rows["validation"],
+        train_groups=groups["train"],
+        validation_groups=groups["validation"],
         options=config.options,
         rng=rng,
-        recordings={recording.name: recording for recording in dataset.recordings},
+        recordings=recordings,
         init=init,
-        freeze=config.freeze,
         device=device,
-        checkpoint=checkpoint,
-        resume=resume,
         progress=progress,
         advance=advance,
     )
     fitted = PREDICTORS[config.kind].fit(task)
     predictor, labels = fitted.model, task.train.y
-    mean, sd = float(labels.mean()), float(labels.std())
-    models = [predictor] if init is None else [predictor, init]
-    parts = tuple(_errors(data, part, models, mean)[0] for part in PARTS[1:])
-    path_of = {recording.name: recording.path for recording in dataset.recordings}
-    _, *paths = _errors(data, "test", models, mean, [path_of[name] for name in data.rows["test"].names])
-    predictor.residual_sd_nt = parts[-1].rmse_nt
-    predictor.metadata.update(_provenance(config, dataset, split, len(labels), device))
-    predictor.metadata.update(label_mean_nt=mean, label_sd_nt=sd)
-    if fitted.history:
-        kept = next(epoch for epoch in reversed(fitted.history) if epoch.best)
-        predictor.metadata.update(epochs_run=fitted.history[-1].number, epoch_kept=kept.number)
-    if fitted.choice:
-        predictor.metadata.update(
-            network="kept" if fitted.choice.kept else "left out",
-            base_validation_mae_nt=fitted.choice.base_mae_nt,
-            whole_validation_mae_nt=fitted.choice.whole_mae_nt,
-        )
-    for part in parts:
-        values = {"mae_nt": part.mae_nt, "naive_mae_nt": part.naive_mae_nt, "ridge_mae_nt": part.ridge_mae_nt}
-        predictor.metadata.update({f"{part.name}_{key}": value for key, value in values.items()})
-        if math.isfinite(part.coverage):
-            predictor.metadata[f"{part.name}_coverage_90"] = part.coverage
-    if (statistics := residuals(_held_out(data, fitted))) is not None:
-        predictor.metadata.update(statistics.metadata())
-    recordings = {recording.name: recording for recording in dataset.recordings}
+    mean = float(labels.mean())
+    ridge = _ridge(dataset, rows, groups["train"])
+    parts = tuple(_errors(part, rows[part], ridge[part], predictor, mean)[0] for part in PARTS[1:])
+    driven = [recordings[name].path for name in rows["test"].names]
+    _, *paths = _errors("test", rows["test"], ridge["test"], predictor, mean, driven)
     learned, tested = ([recordings[name] for name in split.names(part)] for part in ("train", "test"))
     sessions = dict.fromkeys(recording.session for recording in learned)
-    driven = dict.fromkeys(recording.path for recording in learned)
+    ways = dict.fromkeys(recording.path for recording in learned)
     plants = dict.fromkeys(recording.plant or NOMINAL for recording in learned)
+    predictor.residual_sd_nt = parts[-1].rmse_nt
+    predictor.metadata.update(_provenance(config, dataset, split, len(labels), device))
+    predictor.metadata.update(_outcome(fitted, parts))
+    predictor.metadata.update(
+        label_mean_nt=mean,
+        label_sd_nt=float(labels.std()),
+        training_sessions=SEPARATOR.join(sessions),
+        training_paths=SEPARATOR.join(ways),
+    )
+    predictor.metadata.update(residuals(_held_out(rows, dataset, fitted)))
     if config.kind != "mixed" and set(plants) != {NOMINAL}:  # the mean of a mixed model is that of NOMINAL
         predictor.metadata["training_plants"] = SEPARATOR.join(plants)
-    predictor.metadata.update(
-        training_sessions=SEPARATOR.join(sessions), training_paths=SEPARATOR.join(driven)
-    )
-    judged_on = recordings_text(
-        len(tested), [test.session for test in tested], [test.path for test in tested], sessions, driven
-    )
     return TrainingResult(
         predictor=predictor,
         config=config,
         history=fitted.history,
-        choice=fitted.choice,
         split=split,
         parts=parts,
         paths=tuple(paths),
-        label_mean_nt=mean,
-        label_sd_nt=sd,
-        rows=len(labels),
-        judged_on=judged_on,
+        judged_on=recordings_text(
+            len(tested), [test.session for test in tested], [test.path for test in tested], sessions, ways
+        ),
     )
 
 
-def device_of(config: TrainConfig) -> str:
-    """Where torch trains: "cpu" or "cuda".
+def _outcome(fitted: Fit, parts: Sequence[PartErrors]) -> dict[str, MetadataValue]:
+    """Metadata about epochs and errors."""
+    metadata: dict[str, MetadataValue] = {}
+    if fitted.history:
+        kept = next(epoch for epoch in reversed(fitted.history) if epoch.best)
+        metadata |= {"epochs_run": fitted.history[-1].number, "epoch_kept": kept.number}
+    for part in parts:
+        names = ("mae_nt", "naive_mae_nt", "ridge_mae_nt")
+        metadata |= {f"{part.name}_{name}": getattr(part, name) for name in names}
+        if math.isfinite(part.coverage):
+            metadata[f"{part.name}_coverage_90"] = part.coverage
+    return metadata
 
-    Raises:
-        InputError: The configuration asks for a GPU and torch has none.
-    """
+
+def device_of(config: TrainConfig) -> str:
+    """Where torch trains: "cpu" or "cuda"; a GPU that torch does not see is refused."""
     if config.device == "cuda" and not torch.cuda.is_available():
-        raise InputError(
-            "device cuda: this torch sees no GPU; install one that does, or give --device cpu or auto"
-        )
+        raise InputError("device cuda: this torch sees no GPU; install one that does, or take `device=auto`")
     return "cuda" if config.device != "cpu" and torch.cuda.is_available() else "cpu"
 
 
-def _held_out(data: TrainingData, fitted: Fit) -> list[HeldOut]:
-    """Errors on recordings that the model was not fitted to.
-
-    These are validation and test, and training if the model was fitted without each of its groups in turn.
-    """
-    errors = []
+def _read(dataset: Dataset, split: Split, inputs: tuple[str, ...]) -> tuple[RowsOf, Groups]:
+    """Rows of each part, and the session, recording or path of each row, by what the split keeps whole."""
     for part in PARTS:
-        rows = data.rows[part]
-        predicted = fitted.held_out_nt if part == "train" else fitted.model.predict(rows.x)[0]
+        if not split.names(part):
+            raise InputError(f"no recording is in {part}; record more, or hold out fewer")
+    terms = _ridge_terms(dataset)
+    rows = {part: dataset.rows(inputs, split=split, part=part, beside=terms) for part in PARTS}
+    unit = {
+        recording.name: {"session": recording.session, "path": recording.path}.get(split.by, recording.name)
+        for recording in dataset.recordings
+    }
+    if len({unit[name] for name in rows["train"].names}) == 1:  # cross-validation needs two groups
+        unit = {name: name for name in unit}
+    numbers = {name: i for i, name in enumerate(sorted(set(unit.values())))}
+    groups = {
+        part: np.array([numbers[unit[name]] for name in of.names], np.intp)[of.recording]
+        for part, of in rows.items()
+    }
+    return rows, groups
+
+
+def _ridge_terms(dataset: Dataset) -> tuple[str, ...]:
+    """Features of the comparison ridge that a data set has the columns for."""
+    return tuple(name for name in CIRCULAR if set(FEATURES[name].columns) <= set(dataset.columns))
+
+
+def _ridge(dataset: Dataset, rows: RowsOf, groups: NDArray[np.intp]) -> dict[Part, Array]:
+    """Disturbances [nT] by Tolles and Lawson's terms, as far as the data set has them, for each part.
+
+    They are fitted to the training rows. An input that is nan counts as its mean.
+    """
+    known = np.isfinite(rows["train"].beside)
+    mean = np.where(known, rows["train"].beside, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    x = {part: np.where(np.isfinite(of.beside), of.beside, mean) for part, of in rows.items()}
+    y, sd = rows["train"].y, rows["train"].sd
+    model = fit_linear(x["train"], y, groups, features=_ridge_terms(dataset), sd=sd).model
+    return {part: model.predict(of)[0] for part, of in x.items()}
+
+
+def _held_out(rows: RowsOf, dataset: Dataset, fitted: Fit) -> list[HeldOut]:
+    """Errors on validation and test, and on training if each of its groups was left out of a fit in turn."""
+    errors = []
+    for part, of in rows.items():
+        predicted = fitted.held_out_nt if part == "train" else fitted.model.predict(of.x)[0]
         if predicted is not None:
-            errors += held_out_errors(rows, predicted - rows.y, data.dataset.recordings)
+            errors += held_out_errors(of, predicted - of.y, dataset.recordings)
     return errors
 
 
 def _errors(
-    data: TrainingData, part: Part, models: Sequence[Predictor], mean: float, paths: Sequence[str] = ()
+    part: Part, rows: Rows, ridge: Array, model: Predictor, mean: float, paths: Sequence[str] = ()
 ) -> list[PartErrors]:
     """Errors on all rows of a part, then on those of each path; `paths` are those of its recordings."""
-    rows = data.rows[part]
-    naive = mean - rows.y
-    ridge = data.ridge_of(part)[0] - rows.y
-    predicted = [model.predict(rows.x) for model in models]
-    errors = [values - rows.y for values, _ in predicted]
+    predicted, sd = model.predict(rows.x)
+    errors = (predicted - rows.y, mean - rows.y, ridge - rows.y)
     masks = {str(part): np.ones(len(rows.y), bool)}
     for path in dict.fromkeys(paths):
         on_path = np.array([name == path for name in paths])[rows.recording]
@@ -278,14 +262,10 @@ def _errors(
             name,
             len(np.unique(rows.recording[mask])),
             int(mask.sum()),
-            _mae(errors[0][mask]),
-            _rmse(errors[0][mask]),
-            _mae(naive[mask]),
-            _rmse(naive[mask]),
-            _mae(ridge[mask]),
-            _rmse(ridge[mask]),
-            coverage(errors[0][mask], predicted[0][1][mask]),
-            _mae(errors[1][mask]) if len(errors) > 1 else math.nan,
+            *_sizes(errors[0][mask]),
+            *_sizes(errors[1][mask]),
+            *_sizes(errors[2][mask]),
+            coverage(errors[0][mask], sd[mask]),
         )
         for name, mask in masks.items()
     ]
@@ -322,9 +302,6 @@ def _provenance(
     return metadata
 
 
-def _mae(error: Array) -> float:
-    return float(np.mean(np.abs(error)))
-
-
-def _rmse(error: Array) -> float:
-    return float(np.sqrt(np.mean(error**2)))
+def _sizes(error: Array) -> tuple[float, float]:
+    """Mean absolute and root mean square error."""
+    return float(np.mean(np.abs(error))), float(np.sqrt(np.mean(error**2)))

@@ -16,7 +16,6 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files.file import shipped
 from magtwin.io.tables import write_parquet
-from magtwin.learn.compensation.platform import fit_platform, platform_of_run
 from magtwin.learn.compensation.tolles_lawson import (
     TollesLawson,
     band_pass,
@@ -26,12 +25,10 @@ from magtwin.learn.compensation.tolles_lawson import (
     fit_tolles_lawson,
 )
 from magtwin.path import path_named
-from magtwin.run.run import Run
 from magtwin.sim.runs.simulate import simulate
 from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
-from magtwin.spec.sensors import LidarSpec
 
 RATE_HZ = 20.0
 EARTH_NT = np.array([-2700.0, 24000.0, -38400.0])
@@ -67,22 +64,6 @@ def with_platform(b: np.ndarray) -> np.ndarray:
     rate = np.gradient(b, 1 / RATE_HZ, axis=0)
     s, e = (np.reshape(m, (3, 3)) for m in (PLATFORM.soft_iron, PLATFORM.eddy_s))
     return b + b @ s.T + PLATFORM.hard_iron_nt + rate @ e.T
-
-
-def test_regressors_are_those_of_deinterf():
-    peer = pytest.importorskip("deinterf.compensator.tmi.linear.terms")
-    from deinterf.foundation.sensors import MagVector
-    from deinterf.utils.data_ioc import DataIoC
-
-    b = manoeuvres(60)
-    container = DataIoC().with_data(MagVector(*b.T))
-    for ours, theirs in (
-        (("permanent", "induced5", "eddy8"), peer.Terms.Terms_16),
-        (("permanent", "induced6", "eddy9"), peer.Terms.Terms_18),
-    ):
-        matrix, names = design_matrix(b, 1.0, ours)  # its derivatives are a sample apart
-        assert matrix.shape[1] == len(names) == len(set(names))
-        assert_allclose(matrix, np.asarray(container[theirs]), rtol=1e-12, atol=1e-9)
 
 
 def figure_of_merit_flight(rate_hz: float) -> tuple[np.ndarray, np.ndarray]:
@@ -129,14 +110,6 @@ def test_a_figure_of_merit_flight_is_compensated_as_by_deinterfs_own_example():
         assert (apart - apart.mean()).std() < 0.01 * readings.std(), ours
 
 
-def test_the_diagonal_terms_are_those_of_the_whole_matrix():
-    b = manoeuvres(30)
-    whole, names = design_matrix(b, RATE_HZ)
-    diagonal, kept = design_matrix(b, RATE_HZ, ("induced3", "eddy3"))
-    assert kept == ("induced xx", "induced yy", "induced zz", "eddy xdx", "eddy ydy", "eddy zdz")
-    assert_allclose(diagonal, whole[:, [names.index(name) for name in kept]])
-
-
 def test_coefficients_of_a_linear_platform_come_back():
     b = manoeuvres(300)
     matrix, _ = design_matrix(b, RATE_HZ)
@@ -148,15 +121,6 @@ def test_coefficients_of_a_linear_platform_come_back():
     assert model.residual_sd_nt < 1e-3
 
 
-def test_held_out_manoeuvres_lose_over_95_percent_of_the_platform_s_variance():
-    train, test = (with_platform(manoeuvres(180, phase)) for phase in (0.0, 500.0))
-    noise = np.random.default_rng(2).normal(0, 1, (2, len(train)))
-    model = fit_tolles_lawson(np.linalg.norm(train, axis=1) + noise[0], train, RATE_HZ)
-    readings = np.linalg.norm(test, axis=1) + noise[1]
-    assert readings.std() > 100
-    assert model.compensate(readings, test, RATE_HZ).var() < 0.05 * readings.var()
-
-
 def test_a_constant_bias_is_fitted_without_a_band():
     b = manoeuvres(200)
     readings = np.linalg.norm(with_platform(b), axis=1) + 1234.0
@@ -165,130 +129,6 @@ def test_a_constant_bias_is_fitted_without_a_band():
     )
     assert model.coefficients[-1] == pytest.approx(1234.0, abs=400)
     assert abs(np.mean(model.compensate(readings, b, RATE_HZ)) - np.linalg.norm(EARTH_NT)) < 1
-
-
-def test_the_vector_fit_recovers_the_platform():
-    b = manoeuvres(120)
-    found = fit_platform(b, with_platform(b), RATE_HZ)
-    assert_allclose(found.hard_iron_nt, PLATFORM.hard_iron_nt, rtol=1e-6)
-    assert_allclose(found.soft_iron, PLATFORM.soft_iron, atol=1e-10)
-    assert_allclose(found.eddy_s, PLATFORM.eddy_s, atol=1e-10)
-    assert found.left_motor_nt_nm == (0.0, 0.0, 0.0)
-    assert found.left_wheel_moment == 0
-
-
-def test_the_vector_fit_recovers_moments_to_two_percent_through_noise():
-    rng = np.random.default_rng(3)
-    b = manoeuvres(300)
-    torques, on = rng.uniform(-0.05, 0.05, (len(b), 2)), rng.random(len(b)) < 0.3
-    motors = np.array([[3300.0, 6600.0, -3000.0], [5200.0, 3700.0, -4500.0]])
-    lidar = np.array([380.0, -210.0, -540.0])
-    measured = with_platform(b) + torques @ motors + on[:, None] * lidar + rng.normal(0, 20, b.shape)
-    found = fit_platform(b, measured, RATE_HZ, motor_nm=torques, lidar_on=on)
-    assert_allclose(found.hard_iron_nt, PLATFORM.hard_iron_nt, rtol=0.02)
-    assert_allclose([found.left_motor_nt_nm, found.right_motor_nt_nm], motors, rtol=0.02)
-    assert_allclose(found.lidar_nt, lidar, rtol=0.02)
-
-
-EVERYTHING = replace(
-    PLATFORM,
-    left_motor_nt_nm=(-3300.0, -6600.0, 3000.0),
-    right_motor_nt_nm=(-5200.0, -3700.0, 4500.0),
-    lidar_nt=(200.0, -250.0, -1200.0),
-    lidar_cos_nt=(0.0, 60.0, 150.0),
-    lidar_sin_nt=(90.0, 0.0, 0.0),
-    left_wheel_moment=0.012,
-    left_wheel_phase=1.0,
-    right_wheel_moment=0.009,
-    right_wheel_phase=4.0,
-    caster_moment=0.006,
-    caster_phase=2.0,
-    p_base_caster=(0.125, 0.0, 0.0139),
-)
-
-
-def calibration_run(
-    platform: PlatformFieldSpec, *, seed: int = 0, path: str = "figure8"
-) -> tuple[Run, Scene]:
-    """A robot that drives about, its LiDAR on and off; and its scene, which does not know its figures."""
-    robot = RobotSpec(
-        name="robot",
-        asset="robot.usda",
-        p_base_magnetometer=(-0.05, 0.02, 0.35),
-        q_base_magnetometer_link_xyzw=(0.0, 0.0, 0.6, 0.8),
-        lidar=LidarSpec(on_s=15.0, off_s=10.0),
-        platform=PlatformFieldSpec(p_base_caster=EVERYTHING.p_base_caster),
-    )
-    scene = Scene(name="field", map_layer="flat.usdc", robot=robot, earth=EARTH)
-    run = simulate(
-        replace(scene, robot=replace(robot, platform=platform)),
-        path_named(path),
-        anomaly_map=FLAT,
-        rng=np.random.default_rng(seed),
-        duration_s=90.0,
-        rate_hz=60.0,
-    )
-    return run, scene
-
-
-def test_a_run_gives_back_the_moments_of_the_robot_that_drove_it():
-    run, scene = calibration_run(EVERYTHING, path="split_lawnmower")  # its corners tell motors and iron apart
-    found = platform_of_run(run, scene)
-    # the field turns about z alone, so h and S's third column cannot be told apart: what they do together can
-    up = EARTH.b_world_nt[2]
-    permanent = [np.add(p.hard_iron_nt, np.multiply(p.soft_iron[2::3], up)) for p in (found, EVERYTHING)]
-    assert np.linalg.norm(permanent[0] - permanent[1]) < 0.02 * np.linalg.norm(permanent[1])
-    level = [np.reshape(p.soft_iron, (3, 3))[:, :2] for p in (found, EVERYTHING)]
-    assert_allclose(*level, rtol=0.02, atol=1e-4)  # of 24,000 nT, 2 nT
-    for name in ("left_motor_nt_nm", "right_motor_nt_nm", "lidar_nt", "lidar_cos_nt", "lidar_sin_nt"):
-        want = np.array(getattr(EVERYTHING, name))
-        assert_allclose(getattr(found, name), want, rtol=0.02, atol=1.0, err_msg=name)
-    for name in ("left_wheel", "right_wheel", "caster"):
-        for what in ("moment", "phase"):
-            figure = f"{name}_{what}"
-            assert getattr(found, figure) == pytest.approx(getattr(EVERYTHING, figure), rel=0.02), figure
-
-
-def test_wheel_angles_need_the_robot_and_every_signal_its_rows():
-    b = manoeuvres(20)
-    with pytest.raises(InputError, match="wheel_angle needs the robot"):
-        fit_platform(b, with_platform(b), RATE_HZ, wheel_angle=np.zeros((len(b), 2)))
-    with pytest.raises(InputError, match="motor_nm must have 400 rows, got 3"):
-        fit_platform(b, with_platform(b), RATE_HZ, motor_nm=np.zeros((3, 2)))
-    with pytest.raises(InputError, match="must be finite"):
-        fit_platform(b, with_platform(b), RATE_HZ, lidar_on=np.full(len(b), np.nan))
-
-
-def test_a_held_out_run_of_a_whole_robot_loses_over_95_percent_of_the_platforms_variance():
-    # all but the LiDAR, which no attitude tells of
-    plain = replace(EVERYTHING, lidar_nt=(0, 0, 0), lidar_cos_nt=(0, 0, 0), lidar_sin_nt=(0, 0, 0))
-    first, (run, _) = calibration_run(plain, seed=1)[0], calibration_run(plain, seed=2, path="curvilinear")
-    # in a uniform field over a map of it, what the map does not know is what the platform adds
-    platform = run["b_truth_nt"] - run["b_map_nt"]
-    assert platform.std() > 100
-    left = {}
-    for vector, column in (("measured", "b_vector_measured_nt"), ("exact", "b_vector_nt")):
-        model = fit_run(first, vector=vector, band_hz=None)
-        assert model.report("fit").metadata["vector"] == column
-        left[vector] = (platform - model.interference_nt(run[column], 60.0)).var()
-    # the exact vector is as long as the reading itself, so it tells all; axes that are read in turn do not
-    assert left["exact"] < 1e-6 * platform.var() < left["measured"] < 0.05 * platform.var()
-
-
-def test_a_fit_takes_what_the_vector_axes_read_and_the_exact_field_only_when_asked(calibration, tmp_path):
-    run = calibration("figure8", 1)
-    model = fit_run(run, band_hz=None)
-    same = fit_run(run.with_columns(b_vector_nt=np.full((run.rows, 3), np.nan)), band_hz=None)
-    assert model == same
-    exact = fit_run(run, vector="exact", band_hz=None)
-    assert exact.coefficients != model.coefficients
-    blind = run.with_columns(b_vector_measured_nt=np.full((run.rows, 3), np.nan))
-    with pytest.raises(InputError, match=r'no field vectors in b_vector_measured_nt.*vector="exact"'):
-        fit_run(blind)
-    exact.save(tmp_path / "model.json")
-    compensated, report = compensate_run(blind, TollesLawson.load(tmp_path / "model.json"))
-    assert report.metadata["vector"] == "b_vector_nt"
-    assert np.isfinite(compensated["b_measured_nt"]).all()
 
 
 @pytest.fixture(scope="module")
@@ -318,10 +158,8 @@ def test_a_run_compensated_by_another_s_fit_loses_over_95_percent_of_its_varianc
 def test_a_run_without_vectors_is_refused(calibration):
     run = calibration("figure8", 1)
     nothing = np.full((run.rows, 3), np.nan)
-    blind = run.with_columns(b_vector_nt=nothing, b_vector_measured_nt=nothing)
-    for vector in ("measured", "exact"):
-        with pytest.raises(InputError, match=r"no field vectors in .*; record a vector magnetometer"):
-            fit_run(blind, vector=vector)
+    with pytest.raises(InputError, match="no field vectors in b_vector_measured_nt"):
+        fit_run(run.with_columns(b_vector_measured_nt=nothing))
 
 
 def test_the_longest_unbroken_stretch_is_used(calibration):
@@ -334,11 +172,7 @@ def test_the_longest_unbroken_stretch_is_used(calibration):
     assert_allclose(model.coefficients, same.coefficients, rtol=1e-6)
 
 
-def test_a_model_comes_back_from_its_file(tmp_path):
-    b = with_platform(manoeuvres(100))
-    model = fit_tolles_lawson(np.linalg.norm(b, axis=1), b, RATE_HZ)
-    model.save(tmp_path / "model.json")
-    assert TollesLawson.load(tmp_path / "model.json") == model
+ONE = {"terms": ["permanent"], "coefficients": [1], "band_hz": None, "ridge": 0, "residual_sd_nt": 0}
 
 
 @pytest.mark.parametrize(
@@ -348,18 +182,14 @@ def test_a_model_comes_back_from_its_file(tmp_path):
         ("[]", "not a Tolles-Lawson model"),
         ('{"terms": ["permanent"]}', "KeyError: 'coefficients'"),
         ("[" * 100_000, "RecursionError"),
+        (json.dumps(ONE), "1 coefficients for 3 columns"),
+        (json.dumps(ONE | {"vector": "exact"}), "fitted to exact vectors"),
+        (json.dumps(ONE | {"preset": "magnaw"}), "no preset 'magnaw'"),
     ],
 )
 def test_a_file_that_is_no_model_is_refused(tmp_path, text, says):
     (tmp_path / "model.json").write_text(text)
     with pytest.raises(InputError, match=says):
-        TollesLawson.load(tmp_path / "model.json")
-
-
-def test_a_model_whose_coefficients_do_not_fit_its_terms_is_refused(tmp_path):
-    broken = {"terms": ["permanent"], "coefficients": [1], "band_hz": None, "ridge": 0, "residual_sd_nt": 0}
-    (tmp_path / "model.json").write_text(json.dumps(broken))
-    with pytest.raises(InputError, match="1 coefficients for 3 columns"):
         TollesLawson.load(tmp_path / "model.json")
 
 
@@ -391,30 +221,6 @@ def test_what_cannot_be_fitted_is_refused(change, says):
         fit_tolles_lawson(**given)
 
 
-def test_compensate_says_which_vectors_it_took(calibration, tmp_path, capsys):
-    write_parquet(calibration("figure8", 1), tmp_path / "run.parquet")
-    told = {}
-    for name, options in (("measured", []), ("exact", ["--truth"])):
-        model = str(tmp_path / f"{name}.json")
-        main(
-            [
-                "compensate",
-                "fit",
-                str(tmp_path / "run.parquet"),
-                "--out",
-                model,
-                "--no-band",
-                "--json",
-                *options,
-            ]
-        )
-        fitted = json.loads(capsys.readouterr().out)["metadata"]["vector"]
-        out = ["--out", str(tmp_path / f"{name}.parquet"), "--json"]
-        main(["compensate", "apply", str(tmp_path / "run.parquet"), model, *out])
-        told[name] = fitted, json.loads(capsys.readouterr().out)["metadata"]["vector"]
-    assert told == {"measured": ("b_vector_measured_nt",) * 2, "exact": ("b_vector_nt",) * 2}
-
-
 def test_compensate_takes_a_preset_and_keeps_it(calibration, tmp_path, capsys):
     run, model = tmp_path / "run.parquet", tmp_path / "model.json"
     write_parquet(calibration("figure8", 1), run)
@@ -422,9 +228,6 @@ def test_compensate_takes_a_preset_and_keeps_it(calibration, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["metadata"]["preset"] == "magnav"
     assert TollesLawson.load(model).preset == "magnav"
     assert TollesLawson.load(model) == fit_run(calibration("figure8", 1), band_hz=None, preset="magnav")
-    model.write_text(model.read_text().replace('"magnav"', '"magnaw"'))
-    with pytest.raises(InputError, match="no preset 'magnaw'"):
-        TollesLawson.load(model)
 
 
 def test_the_page_on_compensation_takes_out_what_it_says():

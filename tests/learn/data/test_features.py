@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from learn_drives import random_run as a_run
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
@@ -10,22 +11,11 @@ from magtwin.learn.data.features import (
     FULL,
     INDUCED,
     SETS,
-    columns_of,
     feature_names,
     features,
     warming,
 )
 from magtwin.run.run import COLUMNS, Run
-
-
-def a_run(rows=50, seed=0):
-    """A run whose columns are random numbers, so that a swap of any two shows."""
-    rng = np.random.default_rng(seed)
-    columns = {}
-    for name, spec in COLUMNS.items():
-        values = rng.normal(size=(rows,) if spec.width == 1 else (rows, spec.width))
-        columns[name] = values > 0 if spec.unit == "bool" else values
-    return Run(columns)
 
 
 def test_full_is_the_papers_20_inputs_in_its_order():
@@ -138,13 +128,6 @@ def test_nothing_in_circular_tells_one_session_from_another():
         assert_array_equal(features(other, name), features(run, name))
 
 
-def test_gradient_features_are_those_of_a_lever_arm_and_of_a_latency():
-    run = a_run()
-    x = features(run, ["map_gradient_left", "speed_map_gradient_forward"])
-    assert_array_equal(x[:, 0], run["b_map_gradient_nt_m"][:, 1])
-    assert_array_equal(x[:, 1], run["b_map_gradient_nt_m"][:, 0] * run["odom_v"][:, 0])
-
-
 def test_the_size_of_the_measured_vector_is_in_no_feature():
     """It is what is to be predicted."""
     run = a_run()
@@ -172,18 +155,10 @@ def test_a_field_of_nothing_has_no_direction():
     assert np.isnan(features(run, ["cosine_x", "induced_xx"])).all()
 
 
-def test_columns_of_a_set_are_all_that_it_needs():
-    for name in SETS:
-        run = a_run().select(*columns_of(name))
-        assert features(run, name).shape == (50, len(SETS[name]))
-
-
 def test_names_in_one_text_are_a_set_a_feature_or_several_with_commas():
     assert feature_names("full") == FULL
     assert feature_names("lidar_on") == ("lidar_on",)
     assert feature_names("yaw_deg, lidar_on") == ("yaw_deg", "lidar_on")
-    with pytest.raises(InputError, match="no feature 'lidar_of'; did you mean 'lidar_on'"):
-        feature_names("yaw_deg,lidar_of")
 
 
 def test_what_warms_up_has_63_percent_of_its_field_after_one_time_constant():

@@ -127,13 +127,6 @@ def test_lever_arm_and_latency_are_found_together_to_their_stated_spread():
     assert (sd < 0.01).all()
 
 
-def test_an_alignment_is_found_where_every_second_reading_is_lost():
-    runs = [a_run((0.04, -0.03), seed=k, swing=0.5 + k, rate=40) for k in range(2)]
-    lost = np.arange(runs[0].rows) % 2 == 0
-    gaps = [run.with_columns(b_measured_nt=np.where(lost, np.nan, run["b_measured_nt"])) for run in runs]
-    assert_allclose(fit_alignment(gaps, FIELD).lever_arm_m, (0.04, -0.03), atol=0.004)
-
-
 def test_errors_shared_within_groups_make_the_spread_of_students_t():
     rng, x, group = np.random.default_rng(0), np.ones((60, 1)), np.repeat(np.arange(6), 10)
     within = 0
@@ -155,7 +148,7 @@ def test_more_readings_of_the_same_places_do_not_hide_the_errors_of_a_map():
     ]
     wrong = dataclasses.replace(FIELD, values_nt=FIELD.values_nt + np.sum(bumps, axis=0))
     few, many = (
-        np.array(fit_alignment([a_run(seed=k, seconds=40) for k in range(n)], wrong, rounds=3).lever_arm_sd_m)
+        np.array(fit_alignment([a_run(seed=k, seconds=40) for k in range(n)], wrong).lever_arm_sd_m)
         for n in (2, 8)
     )
     assert (many > 0.8 * few).all()
@@ -174,16 +167,6 @@ def test_stated_spreads_of_the_twin_hold_its_true_lever_arm_and_latency():
         scores.append(error / [*found.lever_arm_sd_m, found.latency_sd_s])
     assert 0.6 < np.sqrt(np.mean(np.square(scores))) < 1.2
     assert 0.85 <= np.count_nonzero(np.abs(scores) < 1.645) / 60 <= 0.98
-
-
-def test_what_is_not_asked_for_stays_0_and_the_other_takes_nothing_of_it():
-    found = fit_alignment([a_run(latency=0.1)], FIELD, lever_arm=False)
-    assert found.lever_arm_m == (0.0, 0.0)
-    assert found.lever_arm_sd_m == (0.0, 0.0)
-    assert found.latency_s == pytest.approx(0.1, abs=0.005)
-    still = fit_alignment([a_run((0.03, 0.02))], FIELD, latency=False)
-    assert still.latency_s == still.latency_sd_s == 0
-    assert still.lever_arm_m == pytest.approx((0.03, 0.02), abs=0.003)
 
 
 def test_where_runs_keep_to_one_line_at_one_speed_nothing_is_claimed():
@@ -225,7 +208,5 @@ def test_what_cannot_be_aligned_is_refused():
         fit_alignment([far], FIELD)
     with pytest.raises(InputError, match=r"none of 1200 readings has a label.*the robot was at x, y 38"):
         labelled(far, FIELD)
-    with pytest.raises(InputError, match="neither the lever arm nor the latency"):
-        fit_alignment([a_run()], FIELD, lever_arm=False, latency=False)
     with pytest.raises(InputError, match="lever_arm_m must be within 100 m of 0"):
         Alignment((np.nan, 0.0))

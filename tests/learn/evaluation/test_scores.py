@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from magtwin.errors import InputError
 from magtwin.learn.evaluation.scores import Errors, scores
 from magtwin.report.verdict import Z_90
 
@@ -76,8 +75,3 @@ def test_the_same_seed_gives_the_same_intervals():
     runs = [some_errors(rng.normal(size=(2, 300)), str(k), sd=1.0) for k in range(3)]
     assert scored(runs, 5) == scored(runs, 5)
     assert scored(runs, 5)[1][0].mae_interval_nt != scored(runs, 6)[1][0].mae_interval_nt
-
-
-def test_no_run_is_refused():
-    with pytest.raises(InputError, match="no run to score"):
-        scored([])

@@ -1,6 +1,7 @@
 """Mixed models from a data set, calibrated by a drive, followed online, and used like any predictor."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -105,16 +106,6 @@ def test_a_minute_of_labels_makes_a_new_plant_as_good_as_its_noise(model):
     assert 0.85 < np.mean(held) < 0.97
 
 
-def test_a_drive_keeps_its_labels_where_every_third_reading_is_lost(model):
-    run = a_run(200, "hysteresis")
-    lost = np.arange(run.rows) % 3 == 0  # among them the one at each step of 0.25 s
-    gaps = run.with_columns(b_measured_nt=np.where(lost, np.nan, run["b_measured_nt"]))
-    whole, left = (labelled_drive(model, each, FIELD) for each in (run, gaps))
-    assert len(left.y) == len(whole.y)
-    assert np.isfinite(left.y[1:]).all()
-    assert left.y[1:].mean() == pytest.approx(whole.y.mean(), abs=15)
-
-
 def test_intervals_for_an_unknown_plant_hold_where_nominal_ones_fail(model):
     runs = [a_run(seed, "hysteresis") for seed in range(200, 230)]
     held = {}
@@ -199,27 +190,15 @@ def test_a_poor_drive_is_warned_of(model):
     for run, options, text in (
         (a_run(3, seconds=20.0), {}, "it lasts 20 s, and 30 s are needed"),
         (a_run(3, sector=np.pi / 4), {}, "its headings lie in 2 of 12 sectors"),
-        (
-            a_run(3),
-            {"pose_from_map": True},
-            "were estimated on the magnetic map, so the calibration is circular",
-        ),
+        (a_run(3), {"pose_from_map": True}, "were estimated on the magnetic map"),
         (Run(dict(a_run(3)), {"pose_from_map": True}), {}, "were estimated on the magnetic map"),
     ):
         with pytest.warns(CalibrationWarning, match=text) as given:
             calibrated = mt.calibrate(model, run, anomaly_map=FIELD, **options)
         assert len(given) == 1
         assert text.split(",")[0] in calibrated.metadata["calibration_warnings"]
-    other = AnomalyMap(
-        values_nt=FIELD.values_nt[:, ::-1],
-        origin_m=(-3.0, -3.0),
-        cell_m=(0.5, 0.5),
-        headings_rad=np.zeros(1),
-        name="b",
-    )
-    with pytest.warns(
-        CalibrationWarning, match="trained on the map 'trough' and is calibrated on another, 'b'"
-    ):
+    other = replace(FIELD, values_nt=FIELD.values_nt[:, ::-1], name="b")
+    with pytest.warns(CalibrationWarning, match="trained on the map 'trough' and is calibrated on another"):
         mt.calibrate(model, a_run(3), anomaly_map=other)
 
 
@@ -236,8 +215,7 @@ def test_what_cannot_calibrate_is_refused_in_a_line(model, weights, tmp_path):
         (model, {"run": far}, "none of 600 readings has a label on the map"),
         (model, {"run": simulated}, "its readings come from a neural magnetometer"),
         (model, {"run": run.select("t", "p_world_base", "yaw", "b_measured_nt")}, "no column 'odom_v'"),
-        (model, {"pose_sd_m": -1.0}, "pose_sd_m must be 0 or more and finite, got -1.0"),
-        (model, {"pose_sd_m": 1e300}, "pose_sd_m must be 0 or more and finite, at most 1000 m, got 1e"),
+        (model, {"pose_sd_m": -1.0}, "pose_sd_m must be between 0 and 1000 m, got -1.0"),
         (weights, {"out": tmp_path / "there.safetensors"}, "exists"),
     ):
         with pytest.raises(InputError) as error:
@@ -309,14 +287,8 @@ def test_training_needs_sessions_and_a_nominal_plant(tmp_path):
 def test_the_commands_calibrate_and_refuse_to_widen_what_is_wide(weights, tmp_path, capsys):
     a_run(7, "hysteresis", seconds=20.0).save(tmp_path / "drive.parquet")
     mt.save_map(FIELD, tmp_path / "map.usdc")
-    words = [
-        weights,
-        tmp_path / "drive.parquet",
-        "--map",
-        tmp_path / "map.usdc",
-        "--out",
-        tmp_path / "now.safetensors",
-    ]
+    words = [weights, tmp_path / "drive.parquet", "--map", tmp_path / "map.usdc", "--out"]
+    words.append(tmp_path / "now.safetensors")
     main(["calibrate", *map(str, words), "--json"])
     out, err = capsys.readouterr()
     assert "it lasts 20 s" in err

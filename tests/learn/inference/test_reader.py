@@ -3,8 +3,8 @@ import sys
 
 import numpy as np
 import pytest
+from learn_drives import random_run as a_run
 from numpy.testing import assert_allclose
-from test_features import a_run
 from test_magnetometer import forward64, inputs
 from test_network import RELEASED, a_net
 from test_predictor import KINDS, a_predictor
@@ -103,15 +103,8 @@ def test_a_reading_of_the_released_network_errs_by_less_than_a_hundredth_nt(real
     exact = forward64(net, x)
     for row, y in zip(x.tolist(), exact, strict=True):
         yaw, of = math.radians(row[0]), dict(zip(FULL, row, strict=True))
-        signals = {
-            name: [of[f"{prefix}_{part}"] for part in COLUMNS[name].parts]
-            for name, prefix in (
-                ("odom_v", "odom_v"),
-                ("odom_w", "odom_w"),
-                ("imu_w", "imu_w"),
-                ("imu_a", "imu_a"),
-            )
-        }
+        vectors = ("odom_v", "odom_w", "imu_w", "imu_a")
+        signals = {name: [of[f"{name}_{part}"] for part in COLUMNS[name].parts] for name in vectors}
         q = [of[f"imu_q_{part}"] for part in "xyzw"]
         if q[3] < 0:  # a quaternion that no run holds: what comes in has w >= 0
             continue
@@ -147,10 +140,9 @@ def test_signals_are_those_that_pose_and_map_do_not_give(field):
 @pytest.mark.parametrize(
     ("wrong", "text"),
     [
-        ({"odom_v": None}, "no signal 'odom_v' to read a field by; did you mean 'odom_w'?"),
-        ({"odom_v": (0.0, 1.0)}, r"signal 'odom_v' has 3 numbers in a row, got shape \(2,\)"),
-        ({"imu_q_xyzw": (0.0, 1.0, 0.0)}, r"signal 'imu_q_xyzw' has 4 numbers in a row, got shape \(3,\)"),
-        ({"battery_v": (15.0, 14.0)}, r"signal 'battery_v' has 1 numbers in a row, got shape \(2,\)"),
+        ({"odom_v": None}, "no signal 'odom_v'.*did you mean 'odom_w'"),
+        ({"odom_v": (0.0, 1.0)}, r"'odom_v' has 3 numbers in a row, got shape \(2,\)"),
+        ({"battery_v": (15.0, 14.0)}, r"'battery_v' has 1 numbers in a row, got shape \(2,\)"),
     ],
 )
 def test_signals_that_are_missing_or_of_another_width_are_refused(field, run, wrong, text):

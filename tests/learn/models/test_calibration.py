@@ -3,7 +3,6 @@ import math
 import numpy as np
 import pytest
 
-from magtwin.errors import InputError
 from magtwin.learn.models.calibration import (
     Spread,
     few_groups_factor,
@@ -55,11 +54,6 @@ def test_a_long_recording_counts_as_much_as_a_short_one():
     assert quantile_factor(error, np.ones(10_000), groups) == pytest.approx(50.0 / Z_90)
 
 
-def test_no_row_calibrates_nothing():
-    with pytest.raises(InputError, match="no row to calibrate a standard deviation by"):
-        quantile_factor(np.empty(0), np.empty(0), np.empty(0, int))
-
-
 def test_offsets_of_few_days_widen_by_students_t_and_noise_within_them_does_not():
     rng = np.random.default_rng(2)
     offsets, groups = days(rng, 3, 400, noise_nt=0.0)
@@ -91,15 +85,3 @@ def test_the_luck_of_one_validation_day_is_cancelled_by_a_yardstick_held_against
         with_luck.append(quantile_factor(model, sd[last], groups[last]))
     spread = [np.std(factors) / np.mean(factors) for factors in (without, with_luck)]
     assert spread[0] < 0.5 * spread[1]
-
-
-def test_a_factor_of_few_recordings_is_held_within_bounds():
-    error, groups = np.concatenate([np.full(50, 1e-3), np.full(450, 100.0)]), np.repeat(np.arange(10), 50)
-    known = yardstick(error, np.ones(500), groups, groups == 0)
-    factor = transferred_factor(np.full(50, 1e-3), np.ones(50), np.zeros(50, int), known)
-    assert factor == pytest.approx(3 * 1e-3 / Z_90)
-
-
-def test_what_has_no_standard_deviation_has_no_coverage():
-    assert math.isnan(coverage(np.ones(3), np.full(3, np.nan)))
-    assert coverage(np.array([1.0, 9.0, 1.0]), np.array([1.0, 1.0, np.nan])) == 0.5

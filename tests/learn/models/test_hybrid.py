@@ -7,7 +7,6 @@ from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.hybrid import Hybrid
 from magtwin.learn.models.linear import Linear
-from magtwin.learn.models.predictor import Choice
 
 NAMES = ("odom_v_x", "imu_w_z")
 
@@ -55,12 +54,3 @@ def test_the_base_alone_is_a_hybrid_without_a_network(hybrid):
     assert_array_equal(alone.predict(x)[0], hybrid.base.predict(x)[0])
     assert (alone.layers_text, alone.parameters_count) == ("linear in 2", 3)
     assert hybrid.layers_text == "linear in 2 + 2-8-1"
-
-
-def test_a_network_that_does_no_better_is_left_out_and_both_figures_are_told():
-    assert Choice(100.0, 99.9).kept
-    assert not Choice(100.0, 100.0).kept
-    assert Choice(100.04, 120.0).text() == (
-        "on the validation recordings the base alone errs by 100.0 nT, with the network by 120.0 nT: the "
-        "network is left out, the base alone remains"
-    )

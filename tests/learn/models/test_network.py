@@ -12,7 +12,7 @@ from magtwin.errors import InputError
 from magtwin.learn.data.features import FULL, feature_names
 from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.models.checkpoint import read_checkpoint
-from magtwin.learn.models.network import FieldNet, check_shape, convert
+from magtwin.learn.models.network import FieldNet, convert
 from magtwin.learn.models.perceptron import Layer
 from magtwin.learn.models.predictor import load_predictor
 from magtwin.learn.training.config import TrainConfig
@@ -37,34 +37,8 @@ def a_net(features=FULL, hidden=(8, 4), seed=0, **options):
     )
 
 
-@pytest.mark.parametrize("hidden", [(512, 512, 512, 512), (512, 512, 512, 128), (3,)])
-def test_the_file_alone_tells_the_architecture(tmp_path, hidden):
-    net = a_net(hidden=hidden)
-    net.save(tmp_path / "n.safetensors")
-    again = load_predictor(tmp_path / "n.safetensors")
-    assert again.hidden == hidden
-    for name, value in net.tensors().items():
-        assert_array_equal(again.tensors()[name], value)
-
-
 def test_the_papers_network_has_799233_parameters():
     assert a_net(hidden=TrainConfig().options["layers"]).parameters_count == 799_233
-
-
-def test_what_is_known_of_a_network_survives_the_file(tmp_path):
-    net = a_net(
-        ["yaw_deg", "odom_v_x"], dropout=0.1, residual_sd_nt=12.5, metadata={"source": "here", "rows": 7}
-    )
-    net.save(tmp_path / "n.safetensors")
-    again = load_predictor(tmp_path / "n.safetensors")
-    assert again.features == ("yaw_deg", "odom_v_x")
-    assert (again.dropout, again.residual_sd_nt, again.metadata) == (0.1, 12.5, {"source": "here", "rows": 7})
-
-
-def test_one_network_gives_one_file_byte_for_byte(tmp_path):
-    for name in ("a", "b"):
-        a_net(metadata={"z": 1, "a": 2}).save(tmp_path / name)
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 def test_a_weights_file_has_the_rights_of_any_new_file(tmp_path):
@@ -105,26 +79,11 @@ def test_the_released_network_converts_once_and_stays_itself(real_data, tmp_path
         assert_array_equal(layer.weight, checkpoint[f"layers.{i}.weight"])
         assert_array_equal(layer.bias, checkpoint[f"layers.{i}.bias"])
     assert net.metadata == converted.metadata
+    for name, value in load_predictor(real_data / RELEASED).tensors().items():  # without conversion
+        assert_array_equal(net.tensors()[name], value)
     assert net.metadata["source_sha256"] == "2418abc80cb0eab578e1e8af35f53566db2efa84b1cfa5257710d15273a07cf0"
     assert math.isnan(net.residual_sd_nt)
     assert np.isnan(net.inputs.low).all()
-
-
-def test_a_pth_loads_without_conversion(real_data, tmp_path):
-    convert(real_data / RELEASED, tmp_path / "n.safetensors")
-    a, b = load_predictor(real_data / RELEASED), load_predictor(tmp_path / "n.safetensors")
-    for name, value in a.tensors().items():
-        assert_array_equal(b.tensors()[name], value)
-
-
-def test_an_output_that_exists_is_refused_unless_forced(real_data, tmp_path):
-    out = tmp_path / "n.safetensors"
-    out.write_bytes(b"precious")
-    with pytest.raises(InputError, match="exists already; give `force=True`"):
-        convert(real_data / RELEASED, out)
-    assert out.read_bytes() == b"precious"
-    convert(real_data / RELEASED, out, force=True)
-    assert load_predictor(out).hidden == (512, 512, 512, 128)
 
 
 # Files that are refused
@@ -147,90 +106,46 @@ def ones(*shape):
     return np.ones(shape, np.float32)
 
 
+DEEP = {"metadata": {"magtwin": "[" * 100_000}}
+
+
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (
-            {"drop": ["x_mean"]},
-            "tensor 'x_mean' is missing; train or convert the network again",
-        ),
-        (
-            {"drop": ["layers.1.bias"]},
-            "tensor 'layers.1.bias' is missing; train or convert the network again",
-        ),
-        (
-            {"drop": ["layers.1.weight", "layers.2.weight"]},
-            "tensor 'layers.1.weight' is missing; train or convert the network again",
-        ),
-        (
-            {"layers__0__weight": ones(8, 3)},
-            "tensor 'layers.0.weight' is float32 (8, 3), the 2 features and the other layers ask for "
-            "float32 (8, 2)",
-        ),
-        (
-            {"layers__1__weight": ones(4, 9)},
-            "tensor 'layers.1.weight' is float32 (4, 9), the 2 features and the other layers ask for "
-            "float32 (4, 8)",
-        ),
-        (
-            {"x_mean": 0 * ones(2)},
-            "tensor 'x_mean' is float32 (2,), the 2 features and the other layers ask for float64 (2,)",
-        ),
-        (
-            {"layers__2__bias": math.nan * ones(1)},
-            "tensor 'layers.2.bias' has numbers that are nan or infinite",
-        ),
-        (
-            {"x_scale": np.array([1.0, 0.0])},
-            "a scale of its scalers is not above 0",
-        ),
-        ({"spare": ones(1)}, "tensor 'spare' belongs to no layer of a FieldNet"),
-        (
-            {"about": {"features": ["yaw_deg", "odom_vx"]}},
-            "no feature 'odom_vx'; did you mean 'odom_v_x'?",
-        ),
-        (
-            {"about": {"units": ["rad", "m/s"]}},
-            "reads yaw_deg in 'rad', magtwin gives it in 'deg'",
-        ),
-        ({"about": {"dropout": "much"}}, "'dropout' of its metadata is missing or of the wrong type"),
-        ({"about": {"features": [1, 2]}}, "'features' of its metadata must be names, one at least"),
-        ({"about": {"features": []}}, "'features' of its metadata must be names, one at least"),
-        ({"about": {"features": 5}}, "'features' of its metadata is missing or of the wrong type"),
-        ({"metadata": {"magtwin": '{"a": 5}'}}, "format version None, this magtwin reads 1; update magtwin"),
-        ({"metadata": {"magtwin": "5"}}, "format version None, this magtwin reads 1; update magtwin"),
-        (
-            {"about": {"residual_sd_nt": math.inf}},
-            "'residual_sd_nt' of its metadata must be 0 nT or more and finite, got inf",
-        ),
-        ({"about": {"facts": {"a": [1]}}}, "'a' of its metadata must be text, a number, true or false"),
-        (
-            {"layers__0__weight": ones()},
-            "tensor 'layers.0.weight' is float32 (); a layer's have shape (out, in)",
-        ),
-        (
-            {"layers__2__weight": ones(4)},
-            "tensor 'layers.2.weight' is float32 (4,); a layer's have shape (out, in)",
-        ),
-        ({"about": {"format_version": 2}}, "format version 2, this magtwin reads 1; update magtwin"),
-        ({"metadata": {"magtwin": "{"}}, "its metadata is not JSON (Expecting property name enclosed in "
-                                         "double quotes: line 1 column 2 (char 1))"),
-        (
-            {"metadata": {"magtwin": "[" * 100_000}},
-            "its metadata is not JSON (maximum recursion depth exceeded while decoding a JSON array from a "
-            "unicode string)",
-        ),
-        (
-            {"metadata": {"format": "pt"}},
-            "safetensors without magtwin's metadata; not a network of magtwin's",
-        ),
+        ({"drop": ["x_mean"]}, "tensor 'x_mean' is missing"),
+        ({"drop": ["layers.1.bias"]}, "tensor 'layers.1.bias' is missing"),
+        ({"drop": ["layers.1.weight", "layers.2.weight"]}, "tensor 'layers.1.weight' is missing"),
+        ({"layers__0__weight": ones(8, 3)}, "'layers.0.weight' is float32 (8, 3)"),
+        ({"layers__1__weight": ones(4, 9)}, "'layers.1.weight' is float32 (4, 9)"),
+        ({"layers__0__weight": ones()}, "'layers.0.weight' is float32 (); a layer's"),
+        ({"layers__2__weight": ones(4)}, "'layers.2.weight' is float32 (4,); a layer's"),
+        ({"x_mean": 0 * ones(2)}, "'x_mean' is float32 (2,)"),
+        ({"layers__2__bias": math.nan * ones(1)}, "nan or infinite"),
+        ({"x_scale": np.array([1.0, 0.0])}, "a scale of its scalers"),
+        ({"spare": ones(1)}, "'spare' belongs to no layer"),
+        ({"about": {"features": ["yaw_deg", "odom_vx"]}}, "did you mean 'odom_v_x'"),
+        ({"about": {"units": ["rad", "m/s"]}}, "reads yaw_deg in 'rad'"),
+        ({"about": {"dropout": "much"}}, "'dropout' of its metadata"),
+        ({"about": {"dropout": 1.0}}, "dropout in 0..1"),
+        ({"about": {"features": [1, 2]}}, "'features' of its metadata must be names"),
+        ({"about": {"features": []}}, "'features' of its metadata must be names"),
+        ({"about": {"features": 5}}, "'features' of its metadata is missing"),
+        ({"about": {"residual_sd_nt": math.inf}}, "'residual_sd_nt' of its metadata must be 0 nT or more"),
+        ({"about": {"facts": {"a": [1]}}}, "'a' of its metadata"),
+        ({"about": {"facts": {"a": 10**400}}}, "'a' of its metadata"),
+        ({"about": {"format_version": 2}}, "format version 2"),
+        ({"metadata": {"magtwin": "5"}}, "format version None"),
+        ({"metadata": {"magtwin": "{"}}, "its metadata is not JSON"),
+        (DEEP, "its metadata is not JSON"),
+        ({"metadata": {"format": "pt"}}, "without magtwin's metadata"),
     ],
-)  # fmt: skip
+)
 def test_a_weights_file_that_does_not_hold_together_is_refused(tmp_path, change, text):
     path = changed(tmp_path, **change)
     with pytest.raises(InputError) as refused:
         load_predictor(path)
-    assert str(refused.value) == f"{path}: {text}"
+    assert str(refused.value).startswith(f"{path}: ")
+    assert text in str(refused.value)
 
 
 def test_a_truncated_weights_file_is_refused(tmp_path):
@@ -252,9 +167,3 @@ def test_a_file_of_another_kind_is_refused(tmp_path, content):
 def test_a_folder_is_refused(tmp_path):
     with pytest.raises(InputError, match="a folder; give a weights file"):
         load_predictor(tmp_path)
-
-
-@pytest.mark.parametrize(("hidden", "dropout"), [((), 0.3), ((4, 0), 0.3), ((4,), 1.0)])
-def test_a_network_without_width_or_with_all_units_dropped_is_refused(hidden, dropout):
-    with pytest.raises(InputError, match="a network needs hidden layers"):
-        check_shape(hidden, dropout)

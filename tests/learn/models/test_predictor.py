@@ -5,24 +5,22 @@ import math
 
 import numpy as np
 import pytest
+from learn_drives import random_run as a_run
 from numpy.testing import assert_allclose, assert_array_equal
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
-from test_features import a_run
-from test_network import RELEASED, a_net
+from test_network import a_net
 
 from magtwin.errors import InputError
 from magtwin.learn.data.features import SETS, features
-from magtwin.learn.data.inputs import inputs_from, inputs_of
+from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.mixed.effects import Effects
 from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.hybrid import Hybrid
 from magtwin.learn.models.linear import Linear
-from magtwin.learn.models.predictor import PREDICTORS, load_predictor
-from magtwin.learn.models.regressor import Regressor
-from magtwin.learn.models.weights import write_weights
+from magtwin.learn.models.predictor import load_predictor
 from magtwin.twin import open_twin, simulate, sweep
 
 NAMES = SETS["gradient"]
@@ -89,13 +87,6 @@ def test_a_file_that_is_there_is_kept(predictor, tmp_path):
         predictor.save(tmp_path / "a.safetensors")
 
 
-def test_every_kind_tells_what_it_is(predictor):
-    figures = {figure.name: figure.value for figure in predictor.report("p").figures}
-    assert figures["residual sd"] == 44.0
-    assert predictor.parameters_count > 0
-    assert predictor.layers_text
-
-
 def test_a_magnetometer_tells_of_each_row_its_own_spread(predictor):
     run = a_run(40)
     x = features(run, NAMES)
@@ -107,10 +98,6 @@ def test_a_magnetometer_tells_of_each_row_its_own_spread(predictor):
     assert (len(np.unique(sd)) == 1) == (predictor.kind == "mlp")
 
 
-def test_the_metadata_of_a_run_tell_the_kind_where_it_is_no_perceptron(predictor):
-    assert NeuralMagnetometer(predictor).metadata.get("network_kind", "mlp") == predictor.kind
-
-
 def test_runs_in_one_stream_are_read_as_if_each_were_alone(predictor):
     runs = [a_run(rows, seed).with_columns(t=np.arange(rows) / 135) for seed, rows in enumerate((30, 1, 520))]
     magnetometer = NeuralMagnetometer(predictor)
@@ -118,10 +105,6 @@ def test_runs_in_one_stream_are_read_as_if_each_were_alone(predictor):
         (alone,) = magnetometer.read([run])
         assert_array_equal(read.disturbance_nt, alone.disturbance_nt)
         assert_array_equal(read.sd_nt, alone.sd_nt)
-
-
-def test_a_released_checkpoint_is_a_predictor(real_data):
-    assert load_predictor(real_data / RELEASED).kind == "mlp"
 
 
 def test_a_simulation_is_read_by_any_kind_and_many_as_one(lab_scene, tmp_path):
@@ -137,7 +120,7 @@ def test_a_simulation_is_read_by_any_kind_and_many_as_one(lab_scene, tmp_path):
         assert_array_equal(both[1][name], one[name])
 
 
-@pytest.mark.parametrize("inputs", SETS)
+@pytest.mark.parametrize("inputs", ["session", "vector"])
 def test_robots_that_step_together_read_every_set_of_inputs_but_the_vector_axes(lab_scene, tmp_path, inputs):
     pytest.importorskip("gymnasium")
     from magtwin.gym import MagNavEnv
@@ -173,25 +156,26 @@ def changed(tmp_path, kind, *, about=None, drop=None, **tensors):
         (
             "mlp",
             {"about": {"kind": "oracle", "format_version": 2}},
-            "no predictor kind 'oracle'; known: hybrid, linear, mixed, mlp; update magtwin, or install",
+            "no predictor kind 'oracle'",
         ),
-        ("mlp", {"about": {"kind": ["mlp"]}}, "'kind' of its metadata must be text, got ['mlp']"),
-        (
-            "linear",
-            {"about": {"format_version": 1}},
-            "format version 1, this magtwin reads 2; update magtwin",
-        ),
-        ("linear", {"about": {"penalty": "much"}}, "'penalty' of its metadata is missing or of the wrong"),
-        ("linear", {"about": {"weighted": 1}}, "'weighted' of its metadata is missing or of the wrong type"),
-        ("linear", {"about": {"features": ["yaw_sin", "odom_x"]}}, "no feature 'odom_x'; did you mean"),
-        ("hybrid", {"about": {"sd_factor": 0}}, "'sd_factor' of its metadata must be above 0 and finite"),
-        ("hybrid", {"about": {"sd_factor": True}}, "'sd_factor' of its metadata must be above 0 and finite"),
-        ("hybrid", {"drop": "net.layers.1.weight"}, "tensor 'layers.1.weight' is missing; train or convert"),
-        ("hybrid", {"drop": "base.constant_nt"}, "tensor 'constant_nt' is missing; train the hybrid again"),
-        ("mixed", {"about": {"intervals": "wide"}}, "'intervals' of its metadata must be one of"),
-        ("mixed", {"drop": "noise_floor_nt2"}, "tensor 'noise_floor_nt2' is missing; train the mixed again"),
-        ("mixed", {"prior_covariance_nt2": -np.eye(3)}, "of its prior is not positive definite"),
-        ("hybrid", {"spare": np.ones(1)}, "tensor 'spare' belongs to no layer of a hybrid"),
+        ("mlp", {"about": {"kind": ["mlp"]}}, "'kind' of its metadata must be text"),
+        ("linear", {"about": {"format_version": 1}}, "format version 1"),
+        ("linear", {"about": {"penalty": "much"}}, "'penalty' of its metadata"),
+        ("linear", {"about": {"penalty": 10**400}}, "'penalty' of its metadata"),
+        ("linear", {"about": {"weighted": 1}}, "'weighted' of its metadata"),
+        ("linear", {"about": {"features": ["yaw_sin", "odom_x"]}}, "no feature 'odom_x'"),
+        ("linear", {"spread_floor_nt2": np.array(0.0)}, "a variance of its spread is below 0"),
+        ("linear", {"x_scale": np.zeros(2)}, "a scale of its scalers is not above 0"),
+        ("linear", {"coefficients_nt": np.full(2, math.nan)}, "nan or infinite"),
+        ("linear", {"coefficients_nt": np.ones(3)}, "'coefficients_nt' is float64 (3,)"),
+        ("hybrid", {"about": {"sd_factor": 0}}, "'sd_factor' of its metadata must be above 0"),
+        ("hybrid", {"about": {"sd_factor": True}}, "'sd_factor' of its metadata must be above 0"),
+        ("hybrid", {"drop": "net.layers.1.weight"}, "'layers.1.weight' is missing"),
+        ("hybrid", {"drop": "base.constant_nt"}, "'constant_nt' is missing"),
+        ("hybrid", {"spare": np.ones(1)}, "'spare' belongs to no layer"),
+        ("mixed", {"about": {"intervals": "wide"}}, "'intervals' of its metadata"),
+        ("mixed", {"drop": "noise_floor_nt2"}, "'noise_floor_nt2' is missing"),
+        ("mixed", {"prior_covariance_nt2": -np.eye(3)}, "not positive definite"),
     ],
 )
 def test_a_file_that_does_not_hold_together_is_refused(tmp_path, kind, change, text):
@@ -200,66 +184,3 @@ def test_a_file_that_does_not_hold_together_is_refused(tmp_path, kind, change, t
         load_predictor(path)
     assert str(refused.value).startswith(f"{path}: ")
     assert text in str(refused.value)
-
-
-def test_a_registered_kind_is_loaded_like_a_built_in_one(tmp_path):
-    @PREDICTORS.register("constant")
-    class Constants:
-        load = staticmethod(lambda weights: (weights.kind, weights.features))
-
-    write_weights(
-        tmp_path / "c.safetensors",
-        "constant",
-        {"mean": np.zeros(1)},
-        features=("yaw_sin",),
-        residual_sd_nt=1.0,
-        metadata={},
-    )
-    assert load_predictor(tmp_path / "c.safetensors") == ("constant", ("yaw_sin",))
-    PREDICTORS._loaded.pop("constant")
-
-
-def test_a_module_of_torch_is_a_predictor_of_ones_own(tmp_path):
-    import torch
-
-    class Curve(torch.nn.Module, Regressor):
-        kind, layers_text, parameters_count = "curve", "a curve", 2
-
-        def __init__(self, inputs, residual_sd_nt):
-            torch.nn.Module.__init__(self)
-            Regressor.__init__(self, inputs=inputs, residual_sd_nt=residual_sd_nt)
-            self.line = torch.nn.Linear(len(inputs.features), 1, dtype=torch.float64)
-
-        def predict(self, x):
-            with torch.inference_mode():
-                y = self.line(torch.tanh(torch.tensor(self.inputs.scaled(x)))).squeeze(-1).numpy()
-            return y, np.full(len(y), self.residual_sd_nt)
-
-        def tensors(self):
-            line = {name: value.detach().numpy() for name, value in self.line.state_dict().items()}
-            return self.inputs.tensors() | line
-
-        def settings(self):
-            return {}
-
-        def figures(self):
-            return []
-
-    @PREDICTORS.register("curve")
-    class Curves:
-        @staticmethod
-        def load(weights):
-            model = Curve(
-                inputs_from(weights.features, weights.tensors, weights.path), weights.residual_sd_nt
-            )
-            held = {name: weights.tensors[name] for name in ("weight", "bias")}
-            model.line.load_state_dict({name: torch.tensor(value) for name, value in held.items()})
-            return model
-
-    rng = np.random.default_rng(0)
-    model = Curve(inputs_of(rng.normal(0, 30, (100, len(NAMES))), NAMES), 12.0)
-    model.save(tmp_path / "c.safetensors")
-    run = a_run(30)
-    read = NeuralMagnetometer.load(tmp_path / "c.safetensors").disturbance_nt(run)
-    assert_array_equal(read, model.predict(features(run, NAMES))[0])
-    PREDICTORS._loaded.pop("curve")
