@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from magtwin.files.file import existing, sha256
 from magtwin.files.outputs import output
 from magtwin.frames import wrap_angle, yaw_from_quat
 from magtwin.io.formats import read_run
-from magtwin.io.surveys.maps import map_file, open_map
+from magtwin.io.map_files import map_file, open_map
 from magtwin.localization.bounds import Bounds, bounds
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.odometry import Odometry
@@ -41,7 +41,9 @@ from magtwin.report.report import Figure, Report
 from magtwin.run.run import Run, numbers_in
 from magtwin.run.thinning import field_known, newest
 from magtwin.tasks.own_field import with_own_field
-from magtwin.twin import Twin
+
+if TYPE_CHECKING:
+    from magtwin.twin import Twin
 
 RATE_HZ = 5.0
 """Default rate of readings that a localizer gets [Hz]."""
@@ -304,7 +306,7 @@ def localization(
 
 
 def live_problem(
-    twin: Twin,
+    twin: "Twin",
     anomaly_map: FieldBelief | Source | None = None,
     *,
     sensor: Mapping[str, Any] | None = None,

@@ -12,7 +12,7 @@ from magtwin.bench.suite import Scenario
 from magtwin.bench.twin_case import fogm, twin_case
 from magtwin.errors import InputError
 from magtwin.files.file import shipped
-from magtwin.io.surveys.maps import open_map
+from magtwin.io.map_files import open_map
 from magtwin.localization.problem import OdometryModel, SensorModel
 
 LAB = str(shipped("scenes", "lab", "lab.usda"))
