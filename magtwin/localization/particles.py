@@ -152,11 +152,6 @@ class RaoBlackwell:
         self._kappa = self.kappa or tempering(table, sensor.white_nt)
         self._states(len(self._variance) > 0)
         self._scale_variance = problem.odometry.scale_std**2
-        self._numbers = np.zeros(20)
-        self._numbers[[self._loops.ARM_X, self._loops.ARM_Y]] = sensor.lever_arm_m
-        self._numbers[self._loops.ELSEWHERE] = self._field_mean
-        self._numbers[self._loops.ELSEWHERE_VARIANCE] = self._field_variance
-        self._numbers[self._loops.KAPPA] = self._kappa
         self.reset_count = 0
         self._doubt, self._spread_t = False, -math.inf
         self._old: Array | None = None  # moved by odometry alone since an alarm
@@ -276,46 +271,62 @@ class RaoBlackwell:
 
     def step(self, reading: Reading) -> Estimate:
         """Move the particles, weigh them by the reading, and resample if need be."""
-        k, numbers = self._loops, self._numbers
         forward = left = turn = dt = 0.0
         if self._last is not None:
             forward, left, turn = increment(self._last.odometry, reading.odometry)
             dt = reading.t - self._last.t
         self._last = reading
-        distance = self._set_motion(forward, left, turn, dt)
+        distance = math.hypot(forward, left)
         used = self._usable(reading.b_nt, distance + 0.1 * abs(turn))
-        numbers[k.USED] = used
-        numbers[k.SHIFT] = self._shift
-        numbers[k.FIELD] = reading.b_nt - (reading.disturbance_nt if self.network else 0.0) if used else 0.0
-        extra = reading.disturbance_sd_nt**2 if self.network else 0.0
-        numbers[k.WHITE] = self._problem.sensor.white_nt**2 + extra
-        numbers[k.MAP_WHITE] = self._map_white
+        own, own_sd = (reading.disturbance_nt, reading.disturbance_sd_nt) if self.network else (0.0, 0.0)
         x, y, yaw = self._reference
         yaw += turn
         middle = yaw - turn / 2
         x += forward * math.cos(middle) - left * math.sin(middle)
         y += forward * math.sin(middle) + left * math.cos(middle)
-        numbers[k.X_REF : k.YAW_REF + 1] = x, y, yaw
+        along_sd, across_sd, yaw_sd, gain = self._motion_noise(distance, turn, dt)
+        sensor = self._problem.sensor
+        numbers = self._loops.Step(
+            distance=distance,
+            direction=math.atan2(left, forward),
+            turned=turn,
+            along_sd=along_sd,
+            across_sd=across_sd,
+            yaw_sd=yaw_sd,
+            scale_gain=gain,
+            arm_x=float(sensor.lever_arm_m[0]),
+            arm_y=float(sensor.lever_arm_m[1]),
+            shift=self._shift,
+            used=float(used),
+            field=float(reading.b_nt - own) if used else 0.0,
+            white=float(sensor.white_nt**2 + own_sd**2),
+            map_white=float(self._map_white),
+            kappa=float(self._kappa),
+            elsewhere=self._field_mean,
+            elsewhere_variance=self._field_variance,
+            x_ref=x,
+            y_ref=y,
+            yaw_ref=yaw,
+        )
         decay = np.exp(-dt * self._rates[0] - distance * self._rates[1])
         noise = self._prior_variances * (1 - decay**2)
-        self._run(decay, noise)
-        estimate = self._estimate(reading.t, used)
+        self._run(numbers, decay, noise)
+        estimate = self._estimate(reading.t, used, (x, y, yaw))
         self._maintain(estimate)
         return estimate
 
-    def _set_motion(self, forward: float, left: float, turn: float, dt: float) -> float:
-        """Numbers of the motion; the sampled distances update the variance of the scale error."""
-        k, numbers, model = self._loops, self._numbers, self._problem.odometry
-        distance = math.hypot(forward, left)
+    def _motion_noise(self, distance: float, turn: float, dt: float) -> tuple[float, float, float, float]:
+        """Standard deviations along, across and of the yaw, and gain of the scale error.
+
+        The sampled distances update the variance of the scale error.
+        """
+        model = self._problem.odometry
         along, _, yaw = model.variances(distance, turn, dt).tolist()
         total = along + distance**2 * self._scale_variance
         gain = distance * self._scale_variance / total if total > 0 else 0.0
         least = (0.1 * model.scale_std) ** 2
         self._scale_variance = max(self._scale_variance * (1 - gain * distance), least)
-        numbers[k.DISTANCE], numbers[k.DIRECTION] = distance, math.atan2(left, forward)
-        numbers[k.TURNED], numbers[k.SCALE_GAIN] = turn, gain
-        numbers[k.ALONG_SD : k.YAW_SD + 1] = math.sqrt(total), math.sqrt(along), math.sqrt(yaw)
-        return distance
+        return math.sqrt(total), math.sqrt(along), math.sqrt(yaw), gain
 
     def _usable(self, b_nt: float, moved: float) -> bool:
         """Whether a reading is a number and has not stood still while the robot moved."""
@@ -325,19 +336,17 @@ class RaoBlackwell:
             self._same_nt, self._repeated_m = b_nt, 0.0
         return math.isfinite(b_nt) and self._repeated_m <= STILL_M
 
-    def _run(self, decay: Array, noise: Array) -> None:
+    def _run(self, numbers: Any, decay: Array, noise: Array) -> None:
         """One step of all blocks, on several threads if there are many; the old particles beside them."""
         self._count_steps += 1
         before = self._state
         if len(self._resampled):
             self._state = self._next_state(len(before))
-        self._sums = self._moved(before, self._resampled, self._state, self._count, decay, noise)
+        self._sums = self._moved(before, self._resampled, self._state, self._count, numbers, decay, noise)
         self._resampled = self._resampled[:0]
-        if self._old is not None:
-            old, numbers, used = self._old, self._numbers, self._numbers[self._loops.USED]
-            numbers[self._loops.USED] = 0.0
-            self._moved(old, self._resampled, old, old.shape[1], decay, noise, sign=-1)
-            numbers[self._loops.USED] = used
+        if (old := self._old) is not None:
+            alone = numbers._replace(used=0.0)
+            self._moved(old, self._resampled, old, old.shape[1], alone, decay, noise, sign=-1)
 
     def _moved(
         self,
@@ -345,6 +354,7 @@ class RaoBlackwell:
         chosen: NDArray[np.int64],
         state: Array,
         count: int,
+        numbers: Any,
         decay: Array,
         noise: Array,
         sign: int = 1,
@@ -358,14 +368,14 @@ class RaoBlackwell:
         def work(part: slice) -> None:
             k.step(
                 part.start, part.stop, count, before, chosen, state, sums, self._table, self._variance,
-                self._numbers, decay, noise, self._kinds, key, self.sampled,
+                numbers, decay, noise, self._kinds, key, self.sampled,
             )  # fmt: skip
 
         in_threads(work, blocks, SHARE)
         return sums
 
-    def _estimate(self, t: float, used: bool) -> Estimate:
-        """Weighted mean and covariance; the sum of surprise."""
+    def _estimate(self, t: float, used: bool, reference: tuple[float, float, float]) -> Estimate:
+        """Weighted mean and covariance, from sums about a reference pose; the sum of surprise."""
         k, sums = self._loops, self._sums
         top = float(sums[:, k.TOP].max())
         scales, before = np.exp(sums[:, k.TOP] - top), self._scales
@@ -374,7 +384,7 @@ class RaoBlackwell:
         self._effective = weight**2 / float(scales**2 @ sums[:, k.SQUARES])
         self._shift = top + math.log(weight)
         self._scales = scales / weight
-        x, y, yaw = self._numbers[k.X_REF : k.YAW_REF + 1].tolist()
+        x, y, yaw = reference
         part = total[k.SUM : k.YAW_YAW + 1] / weight
         mean_yaw = math.atan2(total[k.SIN], total[k.COS])
         if abs(_wrapped(mean_yaw - yaw - part[3])) > 0.05:  # the heading is spread around the circle
