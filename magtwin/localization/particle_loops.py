@@ -76,65 +76,26 @@ is not known; and what the lookup in the map needs."""
 class Step(NamedTuple):
     """Numbers of a step; see the module's text."""
 
-    distance: float
-    """[m]."""
-
-    direction: float
-    """Of the motion from the heading halfway [rad]."""
-
-    turned: float
-    """[rad]."""
-
-    along_sd: float
-    """Noise along the motion [m]."""
-
+    distance: float  # [m]
+    direction: float  # of the motion from the heading halfway [rad]
+    turned: float  # [rad]
+    along_sd: float  # noise along the motion, across it [m] and of the heading [rad]
     across_sd: float
-    """Noise across it [m]."""
-
     yaw_sd: float
-    """Noise of the heading [rad]."""
-
-    scale_gain: float
-    """Of the scale error by the noise along the motion [1/m]."""
-
-    arm_x: float
-    """Sensor in base_link [m]."""
-
+    scale_gain: float  # of the scale error by the noise along the motion [1/m]
+    arm_x: float  # sensor in base_link [m]
     arm_y: float
-    """[m]."""
-
-    shift: float
-    """Subtracted from the log weights, so that the weights before this step add up to 1."""
-
-    used: float
-    """1 if there is a reading, else 0."""
-
-    field: float
-    """The reading [nT]."""
-
-    white: float
-    """Variance of its white noise [nT^2]."""
-
-    map_white: float
-    """Share of the map's variance that is white."""
-
-    kappa: float
-    """Divisor of the log likelihood."""
-
-    elsewhere: float
-    """Field where the map is not known [nT]."""
-
-    elsewhere_variance: float
-    """Its variance [nT^2]."""
-
-    x_ref: float
-    """Pose from which the sums are taken: x [m]."""
-
+    shift: float  # subtracted from the log weights, so that the weights before this step add up to 1
+    used: float  # 1 if there is a reading, else 0
+    field: float  # the reading [nT]
+    white: float  # variance of its white noise [nT^2]
+    map_white: float  # share of the map's variance that is white
+    kappa: float  # divisor of the log likelihood
+    elsewhere: float  # field where the map is not known [nT]
+    elsewhere_variance: float  # its variance [nT^2]
+    x_ref: float  # pose from which the sums are taken [m, rad]
     y_ref: float
-    """y [m]."""
-
     yaw_ref: float
-    """yaw [rad]."""
 
 
 class Table(NamedTuple):
