@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from magtwin.bench.case import Case, Truth
+from magtwin.bench.case import Case
 from magtwin.bench.suite import Chunk, Entry, Scenario, Suite
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.frames import quat_from_yaw, yaw_from_quat
+from magtwin.frames import quat_from_yaw
 from magtwin.localization.bounds import Bounds, bounds
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import Localizer, Problem, SensorModel, Smoother
@@ -116,23 +116,17 @@ def make_case(suite: Suite, scenario: Scenario, run: int, fields: Path | None = 
             scenario.number,
             seed,
             start=scenario.prior,
-            odometry=scenario.odometry_model,
-            odometry_factor=scenario.odometry_factor,
+            odometry=scenario.told_odometry,
             rate_hz=scenario.rate_hz,
         )
     from magtwin.bench.magslam import HAND_LOOPS, hand_case, ship_case
 
     if scenario.source == "ship":
-        loop = ship_case(folder, scenario.number, seed)
-    elif 1 <= scenario.number <= len(HAND_LOOPS):
-        loop = hand_case(folder, HAND_LOOPS[scenario.number - 1])
-    else:
-        known = ", ".join(f"{k} ({name})" for k, name in enumerate(HAND_LOOPS, 1))
-        raise InputError(f"scenario {scenario.name!r}: number must be one of {known}, got {scenario.number}")
-    pose = np.column_stack(
-        [loop.truth["p_world_base"][:, :2], np.unwrap(yaw_from_quat(loop.truth["q_world_base_xyzw"]))]
-    )
-    return Case(loop.problem, loop.readings, Truth(loop.truth["t"], pose))
+        return ship_case(folder, scenario.number, seed)
+    if 1 <= scenario.number <= len(HAND_LOOPS):
+        return hand_case(folder, HAND_LOOPS[scenario.number - 1])
+    known = ", ".join(f"{k} ({name})" for k, name in enumerate(HAND_LOOPS, 1))
+    raise InputError(f"scenario {scenario.name!r}: number must be one of {known}, got {scenario.number}")
 
 
 def bounds_of(case: Case) -> Bounds | None:

@@ -110,8 +110,8 @@ def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: P
         calibration=_calibration(scenario, place, session),
         seed=int(rngs["localizer"].integers(2**31)),
     )
-    truth = Truth(t, pose, true_field, tuple(t[cuts].tolist()), scenario.map_error_nt)
-    return Case(problem, readings, truth, {"path": str(drive.metadata.get("path", "")), "session": session})
+    truth = Truth(t, pose, true_field, tuple(t[cuts].tolist()))
+    return Case(problem, readings, truth)
 
 
 @lru_cache(maxsize=4)

@@ -43,7 +43,7 @@ def localize(
         A run in any format that magtwin reads.
     map
         Map layer, stage, folder of survey CSVs, or the name of a scene that ships with magtwin (lab). none:
-        no map, for the methods of simultaneous localization and mapping, such as ekf-slam.
+        no map, for the methods of simultaneous localization and mapping, such as incremental-slam.
     method
         Name of a method, such as rbpf or odometry; or a class of your own as MODULE:CLASS, in the current
         folder or an installed package.

@@ -67,7 +67,7 @@ class Ekf:
             InputError: The problem has no map.
         """
         if problem.belief is None:
-            raise InputError("the EKF needs a map; without one, use ekf-slam or slam-smoother")
+            raise InputError("the EKF needs a map; without one, use incremental-slam")
         self._problem = problem
         self._map = as_map(problem.belief, problem.extent)
         table, spreads = self._map.tables()

@@ -139,7 +139,7 @@ class RaoBlackwell:
             InputError: The problem has no map.
         """
         if problem.belief is None:
-            raise InputError("particle filters need a map; without one, use ekf-slam or slam-smoother")
+            raise InputError("particle filters need a map; without one, use incremental-slam")
         self._loops: Any = LOOPS.open()
         self._problem = problem
         self._rng = np.random.default_rng(problem.seed)

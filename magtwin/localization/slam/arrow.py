@@ -90,11 +90,6 @@ class Solution:
     factor: Array
     """Cholesky factor of C - Y'Y, lower, shape (G, G)."""
 
-    def log_determinant(self) -> float:
-        """Logarithm of the determinant of the matrix."""
-        poses = -2 * np.log(np.diagonal(self.diagonal, axis1=1, axis2=2)).sum()
-        return float(poses + 2 * np.log(np.diagonal(self.factor)).sum())
-
     def pose_covariances(self) -> Array:
         """Diagonal blocks of the poses' part of the inverse, shape (N, D, D)."""
         code = LOOPS.open()
