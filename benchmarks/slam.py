@@ -10,7 +10,7 @@ standard deviation over runs, the median, ANEES of x, y and yaw divided by 3, an
 Nothing is chosen on true positions. "EKF, published settings" has the published length scale, standard
 deviations, noise and number of functions; the EKF is the incremental filter that never solves. The other rows
 keep the published noise of a reading (0.1) and of odometry. Their length scale and standard deviation of the
-field have the greatest marginal likelihood of the readings on a grid (Laplace's approximation, one run of each
+field have the greatest marginal likelihood of the readings on a grid (Laplace's approximation, one run of a
 loop), which needs no true position. Their priors of the magnetometer's offset and soft iron are as large as
 the published noise, and that of odometry's velocity error (5 mm a step) is the round figure above the
 published error (3 mm).

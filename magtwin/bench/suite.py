@@ -347,8 +347,8 @@ class Suite:
                 load_localizer(entry.method, entry.options)
                 if is_weights(entry.compensator):
                     existing(self.path(entry.compensator), "weights file")
-                elif entry.compensator != "none":
-                    find("compensator", entry.compensator, COMPENSATORS)
+                else:
+                    find("compensator", entry.compensator, dict.fromkeys(COMPENSATORS))
         for scenario in self.scenario:
             with _named_in(file, "scenario", scenario.name, ("scene", "paths")):
                 if scenario.source == "twin":

@@ -67,8 +67,8 @@ def localize(
     map_length_m
         Correlation length of the map's error that the method is told [m].
     compensator
-        Model of the robot's own field, whose prediction the method rbpf-network uses: none; iron, ridge or
-        tolles-lawson, fitted to --calibration; or the weights of a trained network (.safetensors, .pth).
+        Model of the robot's own field, whose prediction the method rbpf-network uses: none; iron,
+        fitted to --calibration; or the weights of a trained network (.safetensors, .pth).
     calibration
         Earlier run of the same session, with true poses.
     """

@@ -7,7 +7,7 @@ pose, the true field or a later reading. Poses are x, y [m] and yaw [rad] of bas
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -200,7 +200,7 @@ class Reading:
     """x, y [m] and yaw [rad] of base_link in the frame `odom`."""
 
     disturbance_nt: float = 0.0
-    """The robot's own field as predicted by a `Compensator` [nT]; 0 without one. Not yet subtracted."""
+    """The robot's own field as predicted by a compensator [nT]; 0 without one. Not yet subtracted."""
 
     disturbance_sd_nt: float = 0.0
     """Its standard deviation [nT]."""
@@ -259,19 +259,6 @@ class Smoother(Protocol):
 
     def run(self, problem: Problem, readings: Run) -> Sequence[Estimate]:
         """Estimates at the times of all readings; `readings` has only on-board columns."""
-        ...
-
-
-@runtime_checkable
-class Compensator(Protocol):
-    """A model of the robot's own field from on-board signals."""
-
-    def fit(self, run: Run, field: FieldBelief) -> Self:
-        """Learn from a drive with true poses; returns itself."""
-        ...
-
-    def step(self, reading: Reading) -> tuple[float, float]:
-        """The disturbance at a reading and its standard deviation [nT]."""
         ...
 
 

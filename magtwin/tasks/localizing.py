@@ -203,9 +203,8 @@ def localize(
             metadata.
         odometry: Noise model of the odometry.
         map_length_m: Correlation length of the map's error [m].
-        compensator: Model of the robot's own field for methods that use its prediction (rbpf-network): a
-            name in `magtwin.localization.compensators.COMPENSATORS`, which is fitted to `calibration`; or
-            the weights of a trained network.
+        compensator: Model of the robot's own field for methods that use its prediction (rbpf-network):
+            "none"; "iron", which is fitted to `calibration`; or the weights of a trained network.
         calibration: A drive earlier in the session with true poses, or its file.
         rate_hz: Readings per second that the method gets [Hz]. None: all.
         seed: Seed of the method and of the prior's error.

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.localization.slam.arrow import Arrow, Solution, gram
+from magtwin.localization.arrow import Arrow, Solution, gram
 from magtwin.localization.slam.model import Model, State, cross
 from magtwin.localization.slam.samples import Samples
 

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from oval import first_readings, oval
 from scipy.optimize import least_squares
 
-from magtwin.localization.slam.arrow import Arrow
+from magtwin.localization.arrow import Arrow
 from magtwin.localization.slam.batch import Batch
 from magtwin.localization.slam.model import Model
 from magtwin.localization.slam.samples import samples_of
