@@ -101,7 +101,7 @@ class Results(Summarized):
 
         Returns:
             A table per run and localizer, in the order of the rows: scenario, localizer, run, and the float32
-            arrays t [s], error_m, bound_m, x, y and lost. [] if the benchmark kept none.
+            arrays t [s], error_m, bound_m and lost. [] if the benchmark kept none.
 
         Raises:
             InputError: There is no such scenario or localizer.
@@ -440,7 +440,7 @@ _OF_A_RUN = {
 }
 _SCORES = {name: _kind(value) for name, value in Scores().row().items() if name not in ("failed", "step_us")}
 _KINDS = {ROWS: {**_KEYS, **_OF_A_RUN, **_SCORES}, TIMES: {**_KEYS, "step_us": _NUMBER}}
-_CURVES = ("t", "error_m", "bound_m", "x", "y", "lost")
+_CURVES = ("t", "error_m", "bound_m", "lost")
 _KINDS |= {TRACKS: {**_KEYS, **dict.fromkeys(_CURVES, _CURVE)}}
 """Kinds of the columns of each kind of table; reports read them."""
 

@@ -222,7 +222,7 @@ def time_limit(seconds: float) -> Iterator[None]:
 
 
 def _over_time(case: Case, made: Track | None, limits: Bounds | None) -> Row:
-    """Time, position error, bound, true place and flag at `TRACK_HZ`, as float32."""
+    """Time, position error, bound and flag at `TRACK_HZ`, as float32."""
     truth = case.truth
     every = max(1, round(case.problem.rate_hz / TRACK_HZ))
     rows = slice(None, None, every)
@@ -233,8 +233,6 @@ def _over_time(case: Case, made: Track | None, limits: Bounds | None) -> Row:
         "t": truth.t - truth.t[0],
         "error_m": error,
         "bound_m": unknown if limits is None else limits.correlated,
-        "x": truth.pose[:, 0],
-        "y": truth.pose[:, 1],
         "lost": lost,
     }
     return {name: np.asarray(values[rows], np.float32) for name, values in arrays.items()}

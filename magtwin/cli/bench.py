@@ -92,7 +92,7 @@ def bench(
 
 @bench_app.command
 def report(*folders: Results, out: Path | None = None, force: Force = False) -> Done:
-    """Write a report on results: leaderboard, distributions of errors, errors over time and over the floor.
+    """Write a report on results: leaderboard, distributions of errors, and errors over time.
 
     The report is a folder with bench.html, which is self-contained, bench.md with its pictures, and
     bench.json.

@@ -26,8 +26,8 @@ def with_own_field(run: Run, compensator: str, problem: Problem) -> Run:
 
     Args:
         run: The run; models get its on-board columns.
-        compensator: "none", which changes nothing; "iron", which is fitted to the problem's calibration drive;
-            or the weights of a trained network (.safetensors, .pth).
+        compensator: "none", which changes nothing; "iron", fitted to the problem's calibration drive; or the
+            weights of a trained network (.safetensors, .pth).
         problem: What the method is told.
 
     Raises:
