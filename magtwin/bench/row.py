@@ -14,15 +14,12 @@ import numpy as np
 from magtwin.bench.case import Case
 from magtwin.bench.suite import Chunk, Entry, Scenario, Suite
 from magtwin.errors import InputError
-from magtwin.field.maps.map import AnomalyMap
-from magtwin.frames import quat_from_yaw
 from magtwin.localization.bounds import Bounds, bounds
 from magtwin.localization.localizers import load_localizer
-from magtwin.localization.problem import Localizer, Problem, SensorModel, Smoother
+from magtwin.localization.problem import Localizer, Smoother
 from magtwin.localization.scores import Scores, score
 from magtwin.localization.track import Track, track
 from magtwin.parallel import beat
-from magtwin.run.run import Run
 
 WITHIN_S = 30.0
 """Time within which a localizer must find its pose after an unknown start or a kidnapping [s]."""
@@ -34,6 +31,9 @@ SETUP = 10.0
 """Time to make a case, in time limits of a localizer: the first case opens a scene and compiles loops."""
 
 Row = dict[str, Any]
+
+_warm: set[str] = set()
+"""Localizers that this worker has compiled or loaded."""
 
 
 class TimeLimitError(BaseException):
@@ -67,6 +67,8 @@ def run_chunk(
         beat(f"{run}", times=SETUP)
         case = make_case(suite, scenario, run, fields)
         limits = bounds_of(case)
+        for name in chunk.entries:
+            _warm_up(suite.localizers[name], case)
         for name in chunk.entries:
             entry = suite.localizers[name]
             entry = replace(entry, compensator=suite.path(entry.compensator))
@@ -179,27 +181,16 @@ def smooths(entry: Entry) -> bool:
     return isinstance(algorithm, Smoother) and not isinstance(algorithm, Localizer)
 
 
-def warm_up(entry: Entry) -> None:
-    """Run a localizer of magtwin on a few readings, so that no run's time has compilation in it.
+def _warm_up(entry: Entry, case: Case) -> None:
+    """Run a localizer of magtwin on a few readings once, so that no run's time has compilation in it.
 
     Localizers of others are left alone: what they do wrong counts in their runs.
     """
-    if ":" in entry.method:
+    if ":" in entry.method or repr(entry) in _warm:
         return
-    values = np.fromfunction(lambda h, j, i: 4e4 + 100 * np.sin(i) * np.cos(j), (1, 21, 21))
-    field = AnomalyMap(
-        values_nt=values,
-        variance_nt2=np.full(values.shape, 100.0),
-        origin_m=(-1.0, -1.0),
-        cell_m=(0.1, 0.1),
-        headings_rad=np.zeros(1),
-    )
-    t = np.arange(4) / 5
-    still = np.zeros((4, 3))
-    run = Run({"t": t, "odom_p": still, "odom_q_xyzw": quat_from_yaw(t * 0), "b_measured_nt": 4e4 + t})
-    problem = Problem(belief=field, extent=field.extent, sensor=SensorModel(iron_nt=100.0))
-    with contextlib.suppress(InputError):  # such as one that needs a vector field, which its runs will say
-        track(load_localizer(entry.method, entry.options), problem, run)
+    _warm.add(repr(entry))
+    with contextlib.suppress(InputError):  # which its runs will say
+        track(load_localizer(entry.method, entry.options), case.problem, case.readings.take(slice(0, 4)))
 
 
 @contextmanager

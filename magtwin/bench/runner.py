@@ -11,7 +11,7 @@ from typing import Any
 
 from magtwin.bench import results
 from magtwin.bench.results import Results, Run, runs_of
-from magtwin.bench.row import SETUP, Row, run_chunk, warm_up
+from magtwin.bench.row import SETUP, Row, run_chunk
 from magtwin.bench.suite import Chunk, Seeds, Suite, load_suite, suite_file
 from magtwin.errors import InputError
 from magtwin.files.file import sha256, shipped
@@ -28,9 +28,6 @@ GRACE_S = 60.0
 whose compiled code hangs does not notice the suite's limit [s]."""
 
 Progress = Callable[[int, int, str], Any]
-
-_warm: set[str] = set()
-"""Localizers that this worker has compiled or loaded."""
 
 
 @dataclass(frozen=True)
@@ -223,10 +220,6 @@ def run_task(suite: Suite, fields: Path | None, task: Task) -> tuple[list[Row], 
         text = f"{fields}: this machine does not see the folder of results; put it where all workers do"
         raise InputError(text, parameter="out")
     beat(times=SETUP)
-    for entry in (suite.localizers[name] for name in task.chunk.entries):
-        if repr(entry) not in _warm:
-            warm_up(entry)
-            _warm.add(repr(entry))
     return run_chunk(suite, task.chunk, fields, task.failures)
 
 

@@ -14,6 +14,9 @@ from magtwin.localization.problem import Array, Estimate, Problem, Reading
 
 LOOPS = Loops("magtwin.localization.particle_loops", pays=0)
 
+MOST = 100_000
+"""Greatest number of particles."""
+
 SHARE = 16
 """Blocks of 256 particles that a thread takes at a time."""
 
@@ -85,9 +88,6 @@ class RaoBlackwell:
 
     Args:
         particles: Least number of particles. Default: 3,000; 6,000 for the bootstrap filter.
-        per_m2: Particles per square metre of an unknown position with known heading at the start; four times
-            as many if the heading is unknown. Default: 500; 2,000 for the bootstrap filter.
-        most: Greatest number of particles.
         kappa: Divisor of the log likelihood (tempering): above 1 for a map whose errors depend on each other
             more than their model, as at a place that is passed again. Default: `tempering`.
         map_correlated: Share of the map's variance that is correlated.
@@ -105,31 +105,27 @@ class RaoBlackwell:
     iron: ClassVar[bool] = False
     network: ClassVar[bool] = False
     least: int = 3000
-    start_per_m2: float = 500.0
+    start_per_m2: ClassVar[float] = 500.0
+    """At the start, per square metre of an unknown position; four times as many if the heading is unknown."""
 
     def __init__(
         self,
         *,
         particles: int | None = None,
-        per_m2: float | None = None,
-        most: int = 100_000,
         kappa: float | None = None,
         map_correlated: float = 0.8,
         resets: bool = True,
     ) -> None:
         self.least = self.least if particles is None else particles
-        self.start_per_m2 = self.start_per_m2 if per_m2 is None else per_m2
-        if not (isinstance(self.least, int) and isinstance(most, int) and 2 <= self.least <= most):
+        if not (isinstance(self.least, int) and 2 <= self.least <= MOST):
             raise InputError(
-                f"particles must be a whole number between 2 and most = {most}, got {self.least}",
+                f"particles must be a whole number between 2 and {MOST}, got {self.least}",
                 parameter="particles",
             )
-        if not (self.start_per_m2 > 0 and (kappa is None or kappa > 0) and 0 <= map_correlated <= 1):
+        if not ((kappa is None or kappa > 0) and 0 <= map_correlated <= 1):
             raise InputError(
-                "per_m2 and kappa must be above 0 and map_correlated between 0 and 1, got "
-                f"{self.start_per_m2}, {kappa}, {map_correlated}"
+                f"kappa must be above 0 and map_correlated between 0 and 1, got {kappa}, {map_correlated}"
             )
-        self.most = most
         self.kappa, self.map_correlated, self.resets = kappa, map_correlated, resets
 
     def reset(self, problem: Problem) -> None:
@@ -200,7 +196,7 @@ class RaoBlackwell:
         area = (x1 - x0) * (y1 - y0) if math.isinf(sd[0]) else wide[0] * wide[1]
         turn = min(1.0, wide[2] / (2 * math.pi))
         wanted = self.start_per_m2 * area * (1 + 3 * turn)
-        count = int(min(max(wanted, MOST_TIMES * self.least), self.most))
+        count = int(min(max(wanted, MOST_TIMES * self.least), MOST))
         size = len(self._kinds)
         k = self._loops
         old = 0 if kept is None else kept.shape[1]
@@ -498,7 +494,7 @@ class RaoBlackwell:
 
     def _enough(self, spread: float) -> int:
         """Least number of particles for a spread [m]."""
-        return min(self.most, int(self.least * min(max(spread / NARROW_M, 1.0), MOST_TIMES)))
+        return min(MOST, int(self.least * min(max(spread / NARROW_M, 1.0), MOST_TIMES)))
 
     def _blocks(self, count: int) -> int:
         return -(-count // self._loops.BLOCK)

@@ -16,6 +16,21 @@ from magtwin.localization.problem import Array, Estimate, Problem, Reading
 LOOPS = Loops("magtwin.localization.grid.loops", pays=0.0)
 """Compiled loops; a grid in plain Python would take minutes."""
 
+NODES = 15
+"""Nodes of the window along each of its three axes, odd."""
+
+CELL_M, HEADING_RAD = 0.08, math.radians(7.5)
+"""Greatest distance of starts, and of their headings."""
+
+TEMPER = 1.5
+"""Divisor of the log likelihood if the map has a variance, for errors that the noise model lacks."""
+
+RESET_AT = 12.0
+"""Surprise at which the filter starts again from an unknown pose [nats]."""
+
+SCALE_M = 1.0
+"""Distance over which the odometry's scale error counts as random [m]."""
+
 COMPACT_M = 0.15
 """Spread of the place at which the grid takes over from the bank of starts [m]."""
 
@@ -118,41 +133,7 @@ class PointMass:
     filters on a grid of starts (`magtwin.localization.grid.bank`) stands for it: as cells with a slope.
 
     A reading that repeats itself to the bit while the robot moves is not used, nor is nan.
-
-    Args:
-        nodes: Nodes of the window along each of its three axes, odd.
-        cell_m: Greatest distance of starts [m].
-        heading_deg: Greatest distance of their headings [deg].
-        temper: Divisor of the log-likelihood, above 1 to allow for errors that the noise model lacks.
-            Default: 1, or 1.5 if the map has a variance.
-        reset_at: Surprise [nats] at which the filter starts again from an unknown pose; infinity never does.
-        scale_m: Distance over which the odometry's scale error counts as random [m].
     """
-
-    def __init__(
-        self,
-        *,
-        nodes: int = 15,
-        cell_m: float = 0.08,
-        heading_deg: float = 7.5,
-        temper: float | None = None,
-        reset_at: float = 12.0,
-        scale_m: float = 1.0,
-    ) -> None:
-        for name, value in (("cell_m", cell_m), ("heading_deg", heading_deg), ("reset_at", reset_at)):
-            if not value > 0:
-                raise InputError(f"{name} of PointMass must be above 0, got {value}", parameter=name)
-        if not (nodes >= 9 and nodes % 2 == 1):
-            raise InputError(f"nodes of PointMass must be odd and at least 9, got {nodes}", parameter="nodes")
-        if temper is not None and not temper > 0:
-            raise InputError(f"temper of PointMass must be above 0, got {temper}", parameter="temper")
-        if not 0 <= scale_m < math.inf:
-            raise InputError(
-                f"scale_m of PointMass must be finite and not negative, got {scale_m}", parameter="scale_m"
-            )
-        self._mean, self._lost = np.zeros(3), True
-        self._nodes, self._cell, self._heading = nodes, cell_m, math.radians(heading_deg)
-        self._temper, self._reset_at, self._scale_m = temper, reset_at, scale_m
 
     def reset(self, problem: Problem) -> None:
         """Begin at the prior.
@@ -166,10 +147,10 @@ class PointMass:
         self._problem = problem
         table, spreads = table_of(problem.belief, problem.extent)
         spreads = spreads if spreads.any() else spreads[:0]
-        temper = self._temper or (1.5 if len(spreads) else 1.0)
-        self._likelihood = Likelihood(problem, table, spreads, temper)
+        self._likelihood = Likelihood(problem, table, spreads, TEMPER if len(spreads) else 1.0)
         self._last: Reading | None = None
         self._surprise = 0.0
+        self._mean, self._lost = np.zeros(3), True
         self._begin(problem.prior.mean, problem.prior.sd)
 
     def step(self, reading: Reading) -> Estimate:
@@ -208,8 +189,7 @@ class PointMass:
         return np.column_stack([poses[some], w / w.sum()])
 
     def _begin(self, mean: tuple[float, float, float], sd: tuple[float, float, float]) -> None:
-        cells = {"cell_m": self._cell, "step_rad": self._heading}
-        self.bank = Bank(self._likelihood, mean, sd, **cells)
+        self.bank = Bank(self._likelihood, mean, sd, cell_m=CELL_M, step_rad=HEADING_RAD)
         self.grid: Grid | None = None
         self._lost, self._surprise = any(math.isinf(s) for s in sd), 0.0
         x0, x1, y0, y1 = self._problem.extent
@@ -239,7 +219,7 @@ class PointMass:
 
     def _convolve(self, grid: Grid, variances: Array, distance: float) -> None:
         """Collect the noise of motions; once it is enough, spread the mass with a kernel of its variance."""
-        along = self._problem.odometry.scale_std**2 * distance * self._scale_m
+        along = self._problem.odometry.scale_std**2 * distance * SCALE_M
         self._pending += variances[0], along, variances[2]
         at = grid.lattice
         inverse = np.array([[at.y_j, -at.x_j], [-at.y_i, at.x_i]]) / (at.x_i * at.y_j - at.x_j * at.y_i)
@@ -277,14 +257,14 @@ class PointMass:
             expected += WHITE_SHARE * float(np.mean(self._likelihood.spreads))
         reference = -0.5 - 0.5 * math.log(expected)
         self._surprise = max(0.0, self._surprise + reference - evidence - SLACK)
-        return self._surprise > self._reset_at
+        return self._surprise > RESET_AT
 
     def _fit(self, covariance: Array, spread: float) -> None:
         """Go from the bank to the window, or move and scale the window."""
         n = len(self._likelihood.start)
         if self.grid is None:
             if spread < COMPACT_M and self.bank.smooth(covariance):
-                grid = Grid(self._mean, covariance, self._nodes, n)
+                grid = Grid(self._mean, covariance, NODES, n)
                 self.bank.splat(grid.poses().ravel(), grid.logw, grid.state)
                 if grid.normalise():
                     self.grid = grid
@@ -293,7 +273,7 @@ class PointMass:
         old = self.grid
         if old.fits(self._mean, covariance):
             return
-        new = Grid(self._mean, covariance, self._nodes, n)
+        new = Grid(self._mean, covariance, NODES, n)
         floor = float(old.logw.max()) - 2 * CUT
         before = old.logw, old.state, old.lattice
         self._code.regrid(*before, new.logw, new.state, new.lattice, n, floor)
