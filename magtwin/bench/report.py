@@ -24,7 +24,7 @@ from magtwin.figures.canvas import (
     picture,
 )
 from magtwin.figures.evaluations import INKS
-from magtwin.figures.page import Page, Section, Table, write_page, write_pages
+from magtwin.figures.page import Page, Section, Table, write_pages
 from magtwin.files.outputs import check_free
 from magtwin.report.report import Report
 
@@ -79,29 +79,17 @@ def report_results(
     write_pages(page, out, NAME, force=force)
 
 
-def compare_results(
-    a: str | os.PathLike[str],
-    b: str | os.PathLike[str],
-    out: str | os.PathLike[str] | None = None,
-    *,
-    force: bool = False,
-) -> Report:
+def compare_results(a: str | os.PathLike[str], b: str | os.PathLike[str]) -> Report:
     """Compare two results of one suite, run by run.
 
     Args:
         a: Folder of results.
         b: Folder of other results.
-        out: Page to write: .html, .md or .json. None: none.
-        force: Whether to replace an existing page.
 
     Raises:
-        InputError: A folder holds no results, they share no run, or `out` exists.
+        InputError: A folder holds no results, or they share no run.
     """
-    if out is not None:
-        check_free(out, force=force)
     first, second = read_results(a), read_results(b)
-    if out is not None:
-        write_page(page_of_comparison(first.rows, second.rows, (str(a), str(b))), out, force=force)
     lines = {}
     for d in compare_rows(first.rows, second.rows):
         lines[f"{d.scenario}, {d.a}"] = (
@@ -162,27 +150,6 @@ def page_of_results(
             )
         )
     return Page(title, origin, tuple(sections), data={"standings": [_plain(s) for s in all_of_them]})
-
-
-def page_of_comparison(a: Columns, b: Columns, names: tuple[str, str]) -> Page:
-    """Two results of one suite, run by run.
-
-    Args:
-        a: Rows of the first results.
-        b: Rows of the second.
-        names: Names of the two.
-
-    Raises:
-        InputError: They share no run.
-    """
-    found = compare_rows(a, b)
-    lead = f"A: {names[0]}. B: {names[1]}. Differences of the RMSE on the same runs, A minus B."
-    return Page(
-        "Comparison of benchmarks",
-        lead,
-        (Section("By localizer", "", (), (_differences(found),)),),
-        data={"differences": [_plain(d) for d in found]},
-    )
 
 
 def _described(scenario: Scenario, here: Sequence[Standing], rows: Columns) -> str:
@@ -498,7 +465,7 @@ def _percent(value: float) -> str:
     return "" if math.isnan(value) else f"{100 * value:.0f} %"
 
 
-def _plain(value: Standing | Difference) -> dict[str, Any]:
+def _plain(value: Standing) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for name, entry in vars(value).items():
         out[name] = entry._asdict() if hasattr(entry, "_asdict") else entry

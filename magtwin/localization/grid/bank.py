@@ -156,11 +156,12 @@ class Bank:
             dt, motion = reading.t - last.t, increment(last.odometry, reading.odometry)
         distance = math.hypot(motion[0], motion[1])
         place, _, yaw = self.likelihood.problem.odometry.variances(distance, motion[2], dt).tolist()
-        known, moved = self.likelihood.known(reading, reference), Motion(*map(float, motion), place, yaw)
+        forward, left, turn = map(float, motion)
+        known, moved = self.likelihood.known(reading, reference), Motion(forward, left, turn, place, yaw)
         tables = self.likelihood.table, self.likelihood.spreads
         dynamics = self.likelihood.dynamics(dt, distance)
         sums: Sums = self._code.update_bank(*tables, self.logw, self._state, known, moved, *dynamics)
-        if sums.count < 0.8 * len(self.logw):
+        if sums.kept < 0.8 * len(self.logw):
             kept = np.isfinite(self.logw)
             self._state = np.ascontiguousarray(self._state.reshape(len(kept), -1)[kept]).ravel()
             self.logw = np.ascontiguousarray(self.logw[kept])
@@ -179,8 +180,8 @@ class Bank:
         root = np.linalg.cholesky(np.linalg.inv(covariance + 1e-14 * np.eye(3)))
         return bool(np.linalg.eigvalsh(root.T @ within @ root)[0] > 0.3)
 
-    def splat(self, poses: Array, logw: Array, state: Array) -> None:
-        """Evaluate the mixture at nodes, shape (3 N,): their mass and linear states given the pose."""
+    def splat(self, poses: Array) -> tuple[Array, Array]:
+        """Log mass of the mixture at nodes, shape (N, 3), and their linear states given the pose, (N, s)."""
         some = np.argsort(-self.logw)[:60]
         some = some[self.logw[some] > self.logw[some[0]] - 8]
         means, covariances = self.means[some], self.covariances[some]
@@ -188,9 +189,18 @@ class Bank:
         inverses = np.linalg.inv(pose)
         slopes = covariances[:, 4:, :3] @ inverses
         rest = covariances[:, 4:, 4:] - slopes @ covariances[:, :3, 4:]
-        n = self.n - 4
-        a, b = np.triu_indices(n)
-        linear = np.concatenate([means[:, 4:], slopes.reshape(len(some), -1), rest[:, a, b]], axis=1)
-        weights = self.logw[some] - 0.5 * np.linalg.slogdet(pose)[1]
-        flat = (np.ascontiguousarray(v).ravel() for v in (means[:, :3], inverses, linear))
-        self._code.splat(np.ascontiguousarray(weights), *flat, poses, logw, state)
+        away = poses[:, None] - means[:, :3]
+        away[..., 2] -= 2 * math.pi * np.floor(away[..., 2] / (2 * math.pi) + 0.5)
+        logs = self.logw[some] - 0.5 * np.linalg.slogdet(pose)[1]
+        logs = logs - 0.5 * np.einsum("kgi,gij,kgj->kg", away, inverses, away)
+        most = logs.max(axis=1, keepdims=True)
+        shares = np.exp(logs - most)
+        mass = shares.sum(axis=1, keepdims=True)
+        shares /= mass
+        each = means[:, 4:] + np.einsum("gni,kgi->kgn", slopes, away)
+        mean = np.einsum("kg,kgn->kn", shares, each)
+        each -= mean[:, None]
+        a, b = np.triu_indices(self.n - 4)
+        spread = np.einsum("kg,gm->km", shares, rest[:, a, b])
+        spread += np.einsum("kg,kgn,kgn->kn", shares, each[..., a], each[..., b])
+        return (most + np.log(mass))[:, 0], np.concatenate([mean, spread], axis=1)

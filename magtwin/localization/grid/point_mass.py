@@ -66,7 +66,8 @@ class Grid:
         turns = step * (np.arange(count) - half)
         origin = mean[:2] - self.cell @ (half, half)
         x, y = np.ascontiguousarray((origin + turns[:, None] * slope).T)
-        self.lattice = Lattice(mean[2] + turns, x, y, *self.cell.ravel().tolist(), float(step), count, count)
+        (x_i, x_j), (y_i, y_j) = self.cell.tolist()
+        self.lattice = Lattice(mean[2] + turns, x, y, x_i, x_j, y_i, y_j, float(step), count, count)
         self.states = n
         self.logw: Array = np.full(count**3, -np.inf)
         self.state: Array = np.zeros(count**3 * (n + n * (n + 1) // 2))
@@ -265,7 +266,8 @@ class PointMass:
         if self.grid is None:
             if spread < COMPACT_M and self.bank.smooth(covariance):
                 grid = Grid(self._mean, covariance, NODES, n)
-                self.bank.splat(grid.poses().ravel(), grid.logw, grid.state)
+                logw, state = self.bank.splat(grid.poses())
+                grid.logw[:], grid.state[:] = logw, state.ravel()
                 if grid.normalise():
                     self.grid = grid
                     self._pending[:] = 0.0

@@ -78,7 +78,7 @@ class Sums(NamedTuple):
     """Sums over nodes or filters, of mass times d, the distance from the reference pose, and its products."""
 
     evidence: float  # logarithm of the mean likelihood of the reading
-    count: int  # nodes or filters with mass
+    kept: int  # nodes or filters with mass
     best: int  # the one of most mass
     mass: float
     x: float
