@@ -7,7 +7,6 @@ from dataclasses import MISSING, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
-from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
 from magtwin.bench.leaderboard import Columns, Difference, Standing, compare_rows, standings
@@ -125,9 +124,7 @@ def page_of_results(
     all_of_them = standings(rows, times, compensated)
     names = list(dict.fromkeys(s.localizer for s in all_of_them))
     inks = {name: INKS[k % len(INKS)] for k, name in enumerate(names)}
-    sections = [
-        Section("Leaderboard", _lead(rows), _overview_pictures(all_of_them, inks), (_overview(all_of_them),))
-    ]
+    sections = [Section("Leaderboard", _lead(rows), (), (_overview(all_of_them),))]
     for scenario in dict.fromkeys(s.scenario for s in all_of_them):
         here = [s for s in all_of_them if s.scenario == scenario]
         mine = [t for t in tracks if t["scenario"] == scenario]
@@ -302,39 +299,6 @@ def _failures(rows: Columns, scenario: str) -> Table | None:
         counted[name, reason] = counted.get((name, reason), 0) + 1
     found = sorted(counted.items(), key=lambda item: -item[1])[:20]
     return Table("Failures", ("localizer", "runs", "reason"), tuple((k[0], n, k[1]) for k, n in found))
-
-
-def _overview_pictures(every: Sequence[Standing], inks: Mapping[str, str]) -> tuple[Picture, ...]:
-    """Ratio of RMSE to the bound, a point per localizer and scenario."""
-    known = [s for s in every if s.ratio > 0]
-    if not known:
-        return ()
-    scenarios = list(dict.fromkeys(s.scenario for s in known))
-    figure = new_figure(WIDTH_IN, 1.2 + 0.45 * len(scenarios))
-    ax = figure.subplots()
-    for name in dict.fromkeys(s.localizer for s in known):
-        mine = [s for s in known if s.localizer == name]
-        ax.plot(
-            [s.ratio for s in mine],
-            [scenarios.index(s.scenario) for s in mine],
-            "o",
-            ms=7,
-            color=inks[name],
-            alpha=0.85,
-            label=name,
-        )
-    ax.axvline(1, color=BOUND_INK, lw=1, ls="--")
-    ax.set_xscale("log")
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-    ax.xaxis.set_minor_formatter(FuncFormatter(lambda v, _: f"{v:g}" if f"{v:e}"[0] in "25" else ""))
-    ax.set_yticks(range(len(scenarios)), scenarios)
-    ax.set_ylim(len(scenarios) - 0.5, -0.5)
-    ax.grid(axis="x", color="0.9", lw=0.6)
-    label(ax, "RMSE / bound (1 is the bound)")
-    ax.tick_params(which="minor", labelsize=8)
-    open_frame(ax)
-    legend_below(figure)
-    return (picture(figure, "RMSE of each localizer divided by its own bound", file="ratios"),)
 
 
 def _cdf(here: Sequence[Standing], rows: Columns, inks: Mapping[str, str]) -> Picture | None:

@@ -171,7 +171,7 @@ class Localization:
 
     def report(self) -> Report:
         """Errors beside their bound and dead reckoning, and a verdict in one line."""
-        return report_of(self)
+        return _report_of(self)
 
 
 def localize(
@@ -364,7 +364,7 @@ def new_localizer(out: Source, *, force: bool = False) -> Path:
     return out
 
 
-def report_of(result: Localization) -> Report:
+def _report_of(result: Localization) -> Report:
     """Errors of a localization beside their bound and dead reckoning, and a verdict."""
     run, scores, dead = result.run, result.scores, result.dead_reckoning
     belief = result.problem.belief
@@ -553,8 +553,7 @@ def extent_of(run: Run, belief: FieldBelief | None) -> tuple[float, float, float
 
 def check_map(run: Run, anomaly_map: AnomalyMap, file: Path) -> None:
     """Warn if a map is not the one of the run's scene, by the checksum in the run's metadata."""
-    made = str(run.metadata.get("map_sha256", ""))
-    layer = _layer_of(file)
+    made, layer = str(run.metadata.get("map_sha256", "")), _layer_of(file)
     if anomaly_map.frame and not anomaly_map.frame.startswith("world"):
         warnings.warn(
             f"the map {anomaly_map.name!r} is in the frame {anomaly_map.frame!r}; poses are taken to be in "
