@@ -7,14 +7,11 @@ import numpy as np
 from magtwin.errors import InputError
 from magtwin.field.maps.trilinear import sd_at
 from magtwin.localization.belief import Table, as_map, mean_variance, tempering
-from magtwin.localization.odometry import increment
+from magtwin.localization.odometry import Repeats, increment
 from magtwin.localization.problem import Array, Estimate, Problem, Reading
 
 SETTLED_M = 0.5
 """Standard deviation of the position, sqrt(var x + var y), below which it counts as known [m]."""
-
-STILL_M = 1e-3
-"""Motion, in metres and in radians / 10, within which a reading may repeat itself to the bit."""
 
 MAP_CORRELATED = 0.8
 """Share of the map's variance that is correlated; the rest is white."""
@@ -52,12 +49,8 @@ class Ekf:
         self._map = as_map(problem.belief, problem.extent)
         table, spreads = self._map.tables()
         self._table, self._spreads = memoryview(table.data), memoryview(spreads.data)
-        sensor, prior = problem.sensor, problem.prior
-        x0, x1, y0, y1 = problem.extent
-        wide = (x1 - x0) / math.sqrt(12), (y1 - y0) / math.sqrt(12), math.pi / math.sqrt(3)
-        sd = [s if math.isfinite(s) else w for s, w in zip(prior.sd, wide, strict=True)]
-        pose = ((x0 + x1) / 2, (y0 + y1) / 2, prior.mean[2]) if prior.is_global else prior.mean
-        self._blind = any(math.isinf(s) for s in prior.sd)
+        sensor, (pose, sd) = problem.sensor, problem.start
+        self._blind = any(map(math.isinf, problem.prior.sd))
         variances = [*(s**2 for s in sd), problem.odometry.scale_std**2, sensor.offset_nt**2]
         self._rates: list[tuple[float, float]] = [(0.0, 0.0)] * 5
         self._drift = self._iron = self._error = 0
@@ -84,29 +77,21 @@ class Ekf:
         """Its covariance."""
 
         self._last: Reading | None = None
-        self._repeated_m, self._same_nt, self._surprise = 0.0, math.nan, 1.0
+        self._repeats, self._surprise = Repeats(), 1.0
 
     def step(self, reading: Reading) -> Estimate:
         """Predict by the odometry, update by the reading."""
-        moved = 0.0
+        motion = (0.0, 0.0, 0.0)
         if self._last is not None:
-            forward, left, turn = increment(self._last.odometry, reading.odometry)
-            self._predict(forward, left, turn, reading.t - self._last.t)
-            moved = math.hypot(forward, left) + 0.1 * abs(turn)
+            motion = increment(self._last.odometry, reading.odometry)
+            self._predict(*motion, reading.t - self._last.t)
         self._last = reading
-        if self._usable(reading.b_nt, moved):
+        if self._repeats.usable(reading.b_nt, motion):
             self._update(reading.b_nt, self._problem.rate_hz)
         covariance = self.covariance[:3, :3]
         x, y, yaw = self.state[:3].tolist()
         lost = math.sqrt(covariance[0, 0] + covariance[1, 1]) > SETTLED_M or self._surprise > 4 or self._blind
         return Estimate(reading.t, x, y, yaw, covariance.copy(), float(self.state[OFFSET]), lost)
-
-    def _usable(self, b_nt: float, moved: float) -> bool:
-        if b_nt == self._same_nt:
-            self._repeated_m += moved
-        else:
-            self._same_nt, self._repeated_m = b_nt, 0.0
-        return math.isfinite(b_nt) and self._repeated_m <= STILL_M
 
     def _predict(self, forward: float, left: float, turn: float, dt: float) -> None:
         z, size = self.state, len(self.state)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from magtwin.compiled import Loops, in_threads
 from magtwin.errors import InputError
 from magtwin.localization.belief import known_values, mean_variance, table_of, tempering
-from magtwin.localization.odometry import increment
+from magtwin.localization.odometry import Repeats, increment
 from magtwin.localization.problem import Array, Estimate, Problem, Reading
 
 LOOPS = Loops("magtwin.localization.particle_loops", pays=0)
@@ -43,9 +43,6 @@ nearby may agree with the first readings better."""
 
 SHRINK = 0.95
 """Factor of the number of particles at each reading, while there are more than enough."""
-
-STILL_M = 1e-3
-"""Motion, in metres and in radians / 10, within which a reading may repeat itself to the bit."""
 
 _STRIDE, _WORD = 0x9E3779B97F4A7C15 * 0x2545F4914F6CDD1D, (1 << 64) - 1
 
@@ -152,7 +149,7 @@ class RaoBlackwell:
         self._doubt, self._spread_t = False, -math.inf
         self._old: Array | None = None  # moved by odometry alone since an alarm
         self._last: Reading | None = None
-        self._repeated_m, self._same_nt = 0.0, math.nan
+        self._repeats = Repeats()
         self._start(problem.prior.mean, problem.prior.sd)
 
     def _states(self, has_variance: bool) -> None:
@@ -273,7 +270,7 @@ class RaoBlackwell:
             dt = reading.t - self._last.t
         self._last = reading
         distance = math.hypot(forward, left)
-        used = self._usable(reading.b_nt, distance + 0.1 * abs(turn))
+        used = self._repeats.usable(reading.b_nt, (forward, left, turn))
         own, own_sd = (reading.disturbance_nt, reading.disturbance_sd_nt) if self.network else (0.0, 0.0)
         x, y, yaw = self._reference
         yaw += turn
@@ -323,14 +320,6 @@ class RaoBlackwell:
         least = (0.1 * model.scale_std) ** 2
         self._scale_variance = max(self._scale_variance * (1 - gain * distance), least)
         return math.sqrt(total), math.sqrt(along), math.sqrt(yaw), gain
-
-    def _usable(self, b_nt: float, moved: float) -> bool:
-        """Whether a reading is a number and has not stood still while the robot moved."""
-        if b_nt == self._same_nt:
-            self._repeated_m += moved
-        else:
-            self._same_nt, self._repeated_m = b_nt, 0.0
-        return math.isfinite(b_nt) and self._repeated_m <= STILL_M
 
     def _run(self, numbers: Any, decay: Array, noise: Array) -> None:
         """One step of all blocks, on several threads if there are many; the old particles beside them."""

@@ -185,6 +185,15 @@ class Problem:
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"`{name}` must be above 0, got {getattr(self, name)}", parameter=name)
 
+    @property
+    def start(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Mean and standard deviation of the prior, or where that is infinite, of a uniform pose."""
+        (x0, x1, y0, y1), prior = self.extent, self.prior
+        wide = (x1 - x0) / math.sqrt(12), (y1 - y0) / math.sqrt(12), math.pi / math.sqrt(3)
+        x, y, yaw = (s if math.isfinite(s) else w for s, w in zip(prior.sd, wide, strict=True))
+        mean = ((x0 + x1) / 2, (y0 + y1) / 2, prior.mean[2]) if prior.is_global else prior.mean
+        return mean, (x, y, yaw)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:

@@ -10,7 +10,7 @@ from magtwin.frames import yaw_from_quat
 from magtwin.localization.arrow import Arrow
 from magtwin.localization.belief import as_map, table_of
 from magtwin.localization.grid.point_mass import PointMass
-from magtwin.localization.odometry import STILL_M, increment
+from magtwin.localization.odometry import STILL_M, increment, moved
 from magtwin.localization.problem import Array, Estimate, Problem
 from magtwin.localization.readings import readings_of
 from magtwin.run.run import Run
@@ -303,18 +303,11 @@ class MapSmoother:
         starts = [poses]
         prior = graph.problem.prior
         if not prior.is_global and math.isfinite(prior.sd[2]):
-            reckoned = [np.array(prior.mean, float)]
+            reckoned = [prior.mean]
             for motion in graph.motion:
                 reckoned.append(moved(reckoned[-1], motion))
             starts.append(np.array(reckoned))
         return starts
-
-
-def moved(pose: Array, motion: Array) -> Array:
-    """A pose after a motion (forward, left, turn); see `magtwin.localization.odometry.increment`."""
-    c, s = math.cos(pose[2] + motion[2] / 2), math.sin(pose[2] + motion[2] / 2)
-    made: Array = pose + np.array([motion[0] * c - motion[1] * s, motion[0] * s + motion[1] * c, motion[2]])
-    return made
 
 
 def moved_back(pose: Array, motion: Array) -> Array:

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from magtwin.compiled import Loops
+from magtwin.localization.belief import Table, known_values
 from magtwin.localization.grid.state import Known, Motion, Sums
 from magtwin.localization.odometry import increment
 from magtwin.localization.problem import Array, Problem, Reading
@@ -30,14 +31,9 @@ class Likelihood:
     """
 
     def __init__(self, problem: Problem, table: Array, spreads: Array, temper: float) -> None:
-        from magtwin.field.maps.trilinear import planes
-
         self.problem, self.table, self.spreads, self.temper = problem, table, spreads, temper
         self.mapped, self.iron = len(spreads) > 0, problem.sensor.iron_nt > 0
-        begin, end, *_ = planes(table)
-        values = table[begin:end]
-        if len(table) > end:
-            values = values[table[end:] == 0]
+        values = known_values(Table(table, spreads))
         self.wide = (float(values.mean()), float(values.var()) + 1.0)
         sensor = problem.sensor
         sd = [sensor.offset_nt, sensor.drift_nt]

@@ -10,7 +10,7 @@ from magtwin.errors import InputError
 from magtwin.localization.belief import table_of
 from magtwin.localization.grid.bank import SPAN, Bank, Likelihood, moments
 from magtwin.localization.grid.state import CUT, WHITE_SHARE, Lattice, Sums
-from magtwin.localization.odometry import increment, repeats
+from magtwin.localization.odometry import Repeats, increment, moved
 from magtwin.localization.problem import Array, Estimate, Problem, Reading
 
 LOOPS = Loops("magtwin.localization.grid.loops", pays=0.0)
@@ -150,14 +150,15 @@ class PointMass:
         spreads = spreads if spreads.any() else spreads[:0]
         self._likelihood = Likelihood(problem, table, spreads, TEMPER if len(spreads) else 1.0)
         self._last: Reading | None = None
-        self._surprise = 0.0
+        self._repeats = Repeats()
         self._mean, self._lost = np.zeros(3), True
         self._begin(problem.prior.mean, problem.prior.sd)
 
     def step(self, reading: Reading) -> Estimate:
         """Move by the odometry, use the field, and fit the window to the posterior."""
         last, self._last = self._last, reading
-        if repeats(last, reading):
+        motion = (0.0, 0.0, 0.0) if last is None else increment(last.odometry, reading.odometry)
+        if not self._repeats.usable(reading.b_nt, motion):
             reading = replace(reading, b_nt=math.nan)
         if self.grid is not None:
             sums = self._step_grid(last, reading)
@@ -205,18 +206,12 @@ class PointMass:
         motion, dt = increment(last.odometry, reading.odometry), reading.t - last.t
         grid.move(*motion)
         distance = math.hypot(motion[0], motion[1])
-        self._mean = self._moved(self._mean, *motion)
+        self._mean = np.array(moved(tuple(self._mean.tolist()), motion))
         self._convolve(grid, self._problem.odometry.variances(distance, motion[2], dt), distance)
         known, dynamics = self._likelihood.known(reading, self._mean), self._likelihood.dynamics(dt, distance)
         tables = self._likelihood.table, self._likelihood.spreads
         sums: Sums = self._code.update(*tables, grid.logw, grid.state, grid.lattice, known, *dynamics)
         return sums
-
-    @staticmethod
-    def _moved(pose: Array, forward: float, left: float, turn: float) -> Array:
-        c, s = math.cos(pose[2] + turn / 2), math.sin(pose[2] + turn / 2)
-        made: Array = pose + np.array([forward * c - left * s, forward * s + left * c, turn])
-        return made
 
     def _convolve(self, grid: Grid, variances: Array, distance: float) -> None:
         """Collect the noise of motions; once it is enough, spread the mass with a kernel of its variance."""
