@@ -62,7 +62,7 @@ def bench(
     data
         Folders of the data that the suite needs, as NAME=FOLDER, such as ship=magslam/ship.
     jobs
-        Number of processes. Default: one for each processor, as far as memory allows.
+        Number of processes. Default: one for each processor.
     no_tracks
         Do not write the errors over time, which the report draws.
     """
