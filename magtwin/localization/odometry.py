@@ -1,6 +1,7 @@
 """Odometry: increments of the pose, and dead reckoning."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -30,7 +31,7 @@ def increment(
     return dx * c + dy * s, dy * c - dx * s, turn
 
 
-def moved(pose: tuple[float, float, float], motion: tuple[float, float, float]) -> tuple[float, float, float]:
+def moved(pose: Sequence[float] | Array, motion: Sequence[float] | Array) -> tuple[float, float, float]:
     """A pose after a motion (forward, left, turn) of `increment`."""
     (x, y, yaw), (forward, left, turn) = pose, motion
     c, s = math.cos(yaw + turn / 2), math.sin(yaw + turn / 2)

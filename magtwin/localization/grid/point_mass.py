@@ -206,7 +206,7 @@ class PointMass:
         motion, dt = increment(last.odometry, reading.odometry), reading.t - last.t
         grid.move(*motion)
         distance = math.hypot(motion[0], motion[1])
-        self._mean = np.array(moved(tuple(self._mean.tolist()), motion))
+        self._mean = np.asarray(moved(self._mean, motion), float)
         self._convolve(grid, self._problem.odometry.variances(distance, motion[2], dt), distance)
         known, dynamics = self._likelihood.known(reading, self._mean), self._likelihood.dynamics(dt, distance)
         tables = self._likelihood.table, self._likelihood.spreads
