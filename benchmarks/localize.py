@@ -27,7 +27,7 @@ from plain_particles import PlainFilter
 
 from magtwin import compiled
 from magtwin.field.maps.lookup import LOOPS
-from magtwin.io.surveys.maps import open_map
+from magtwin.io.map_files import open_map
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import Problem, Reading, SensorModel
 

@@ -1,7 +1,6 @@
 """Case: one run of a benchmark, as a localizer gets it, and the truth that it is scored by."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +27,6 @@ class Truth:
     kidnapped_s: tuple[float, ...] = ()
     """Times at which the robot was put elsewhere [s]."""
 
-    map_error_nt: float = 0.0
-    """Standard deviation of the belief's error [nT], for the bounds."""
-
 
 @dataclass(frozen=True, eq=False)
 class Case:
@@ -44,6 +40,3 @@ class Case:
 
     truth: Truth
     """Poses at the readings."""
-
-    metadata: Mapping[str, str | int | float | bool] = field(default_factory=dict)
-    """Origin of the case: scene, path, session, checksums."""

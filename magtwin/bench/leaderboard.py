@@ -137,7 +137,7 @@ def _standing(scenario: str, localizer: str, rows: Columns, step_us: float, comp
         localizer=localizer,
         runs=count,
         failed=int(np.count_nonzero(rows["status"] != "ok")),
-        rmse_m=bootstrap(errors, sessions, statistic=rms, resamples=1000) if len(errors) else None,
+        rmse_m=bootstrap(errors, sessions, rms, resamples=1000) if len(errors) else None,
         median_m=float(np.median(errors)) if len(errors) else math.nan,
         p95_m=float(np.percentile(errors, 95)) if len(errors) else math.nan,
         heading_rad=_rms(rows["heading_rad"][good]),

@@ -12,19 +12,20 @@ import math
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from magtwin.bench.case import Case, Truth
 from magtwin.errors import InputError
 from magtwin.files.budget import check_decoded, decoded_limit
 from magtwin.files.children import run
 from magtwin.files.file import existing_file
+from magtwin.frames import yaw_from_quat
 from magtwin.localization.problem import OdometryModel, Prior, Problem, SensorModel
 from magtwin.run.run import Run
 
@@ -45,20 +46,10 @@ SHIP_BIAS_M = (0.003, 0.003, 0.0)
 SHIP_NOISE, SHIP_LENGTH_M, SHIP_POTENTIAL_SD, SHIP_UNIFORM_SD = 0.1, 0.8, 1.0, 1.0
 """Published noise, length scale, sd of the potential and sd of the uniform field, in units of the ship."""
 
-SHIP_OFFSET = 0.1
-"""Prior standard deviation of the magnetometer's offset: the noise of one reading, in units of the ship."""
-
-SHIP_LIKELY = (0.01, 0.05, 3.0)
-"""White noise and drift of a reading, in units of the ship, and correlation time of the drift [s].
-
-They have the greatest marginal likelihood of those compared: errors of the readings and of the field model
-last for seconds.
-"""
-
 SHIP_FUNCTIONS = {1: 50, 2: 50, 3: 100, 4: 50}
 """Published number of eigenfunctions of each loop."""
 
-HAND_LOOPS: tuple[Literal["eight", "square"], ...] = ("eight", "square")
+HAND_LOOPS = ("eight", "square")
 """Names of the hand-held loops, by which a suite numbers them from 1."""
 
 HAND_NOISE_NT = 2_000.0
@@ -68,33 +59,7 @@ HAND_POSITION_STD_S, HAND_TURN_STD_S = 0.05, 1e-3
 """Random walks assumed for the odometry of the hand-held loops [m/sqrt(s), rad/sqrt(s)]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Recording:
-    """A recorded loop as a localization task."""
-
-    problem: Problem
-    """What an algorithm is told."""
-
-    readings: Run
-    """On-board columns only."""
-
-    truth: Run
-    """`t`, `p_world_base` and `q_world_base_xyzw`."""
-
-    vertical_std_s: float
-    """Random walk of odometry's height [m/sqrt(s)], an option of the SLAM methods."""
-
-    tilt_std_s: float
-    """Random walk of odometry's roll and pitch [rad/sqrt(s)], an option of the SLAM methods."""
-
-
-def ship_case(
-    folder: str | os.PathLike[str],
-    loop: int,
-    seed: int,
-    *,
-    noise: Literal["published", "likely"] = "published",
-) -> Recording:
+def ship_case(folder: str | os.PathLike[str], loop: int, seed: int) -> Case:
     """A loop of the model ship with the published random odometry.
 
     Each increment of the position in world axes is the true one plus the bias `SHIP_BIAS_M` and normal noise;
@@ -106,16 +71,12 @@ def ship_case(
         loop: 1 to 4.
         seed: Seed of the odometry's noise. An odd seed has the noise of the one before with the opposite sign
             (antithetic pairs), which makes means over an even number of seeds more precise.
-        noise: What the problem states of the readings: the published white noise, or `SHIP_LIKELY`.
 
     Raises:
         InputError: There is no such loop, or its file is missing or wrong.
     """
     if loop not in SHIP_FUNCTIONS:
         raise InputError(f"loop must be 1, 2, 3 or 4, got {loop}", parameter="loop")
-    if noise not in ("published", "likely"):
-        raise InputError(f"noise must be published or likely, got {noise!r}", parameter="noise")
-    white, drift, drift_s = (SHIP_NOISE, 0.0, 1.0) if noise == "published" else SHIP_LIKELY
     path = Path(folder) / f"Aligned_SquareLoop_{loop}.mat"
     data = _matlab(path, _SHIP)
     p, rotation, dt = data["p"].T, _rotation(data["q"].T, path), float(data["T"].item())
@@ -136,32 +97,14 @@ def ship_case(
         belief=None,
         extent=(p[:, 0].min(), p[:, 0].max(), p[:, 1].min(), p[:, 1].max()),
         prior=_start(p0, R0),
-        sensor=SensorModel(
-            white_nt=white * SHIP_UNIT_NT,
-            drift_nt=drift * SHIP_UNIT_NT,
-            drift_s=drift_s,
-            offset_nt=SHIP_OFFSET * SHIP_UNIT_NT,
-        ),
-        odometry=OdometryModel(
-            position_std=0.0,
-            yaw_std=0.0,
-            turn_std=0.0,
-            position_std_s=math.sqrt(SHIP_STEP_VARIANCE_M2 / dt),
-            yaw_std_s=math.sqrt(SHIP_TURN_VARIANCE / dt),
-            scale_std=0.0,
-        ),
+        sensor=_sensor(SHIP_NOISE * SHIP_UNIT_NT, drift_s=1.0),
+        odometry=_odometry(math.sqrt(SHIP_STEP_VARIANCE_M2 / dt), math.sqrt(SHIP_TURN_VARIANCE / dt)),
         map_length_m=SHIP_LENGTH_M,
         rate_hz=1 / dt,
         seed=seed,
     )
     t = np.asarray(dt * np.arange(len(p)), float)
-    return Recording(
-        problem,
-        _readings(t, odom_p, odom_q, y_nt),
-        _truth(t, p, rotation.as_quat()),
-        math.sqrt(SHIP_HEIGHT_VARIANCE_M2 / dt),
-        math.sqrt(SHIP_TURN_VARIANCE / dt),
-    )
+    return Case(problem, _readings(t, odom_p, odom_q, y_nt), _truth(t, p, rotation.as_quat()))
 
 
 def ship_options(loop: int | None = None) -> dict[str, Any]:
@@ -174,8 +117,6 @@ def ship_options(loop: int | None = None) -> dict[str, Any]:
         "length_m": SHIP_LENGTH_M,
         "sd_nt": SHIP_POTENTIAL_SD / SHIP_LENGTH_M * SHIP_UNIT_NT,
         "uniform_sd_nt": SHIP_UNIFORM_SD * SHIP_UNIT_NT,
-        "kernel": "se",
-        "margin_m": 1.0,
         "odometry_axes": "world",
     }
     if loop is not None:
@@ -183,7 +124,7 @@ def ship_options(loop: int | None = None) -> dict[str, Any]:
     return options
 
 
-def hand_case(folder: str | os.PathLike[str], name: Literal["eight", "square"]) -> Recording:
+def hand_case(folder: str | os.PathLike[str], name: str) -> Case:
     """A hand-held loop: smoothed visual-inertial odometry, three axes of a telephone.
 
     The files have no true pose. The reference is the telephone's own visual-inertial tracking, which corrects
@@ -215,25 +156,13 @@ def hand_case(folder: str | os.PathLike[str], name: Literal["eight", "square"]) 
         belief=None,
         extent=(low[0], high[0], low[1], high[1]),
         prior=_start(start, rotation[0]),
-        sensor=SensorModel(white_nt=HAND_NOISE_NT, drift_nt=0.0, offset_nt=HAND_NOISE_NT),
-        odometry=OdometryModel(
-            position_std=0.0,
-            yaw_std=0.0,
-            turn_std=0.0,
-            position_std_s=HAND_POSITION_STD_S,
-            yaw_std_s=HAND_TURN_STD_S,
-            scale_std=0.0,
-        ),
+        sensor=_sensor(HAND_NOISE_NT),
+        odometry=_odometry(HAND_POSITION_STD_S, HAND_TURN_STD_S),
         map_length_m=SHIP_LENGTH_M,
         rate_hz=(len(t) - 1) / (t[-1] - t[0]),
     )
-    return Recording(
-        problem,
-        _readings(t, odometry, rotation.as_quat(), np.column_stack([-y, x, z])),
-        _truth(t, reference, rotation.as_quat()),
-        HAND_POSITION_STD_S,
-        HAND_TURN_STD_S,
-    )
+    readings = _readings(t, odometry, rotation.as_quat(), np.column_stack([-y, x, z]))
+    return Case(problem, readings, _truth(t, reference, rotation.as_quat()))
 
 
 _LOAD = """
@@ -311,9 +240,20 @@ def _accumulated(first: Rotation, increments: Rotation) -> Array:
     return np.asarray(Rotation.from_matrix(np.array(R)).as_quat())
 
 
-def _start(p: Array, R: Rotation, sd: tuple[float, float, float] = (1e-3, 1e-3, 1e-3)) -> Prior:
+def _start(p: Array, R: Rotation) -> Prior:
     m = R.as_matrix()
-    return Prior(mean=(float(p[0]), float(p[1]), math.atan2(m[1, 0], m[0, 0])), sd=sd)
+    return Prior(mean=(float(p[0]), float(p[1]), math.atan2(m[1, 0], m[0, 0])), sd=(1e-3, 1e-3, 1e-3))
+
+
+def _sensor(noise_nt: float, drift_s: float = SensorModel.drift_s) -> SensorModel:
+    """White noise, and an offset as large."""
+    return SensorModel(white_nt=noise_nt, drift_nt=0.0, drift_s=drift_s, offset_nt=noise_nt)
+
+
+def _odometry(position_std_s: float, yaw_std_s: float) -> OdometryModel:
+    """Random walks over time alone."""
+    none = dict.fromkeys(("position_std", "yaw_std", "turn_std", "scale_std"), 0.0)
+    return OdometryModel(**none, position_std_s=position_std_s, yaw_std_s=yaw_std_s)
 
 
 def _readings(t: Array, p: Array, q: Array, y_nt: Array) -> Run:
@@ -328,6 +268,5 @@ def _readings(t: Array, p: Array, q: Array, y_nt: Array) -> Run:
     )
 
 
-def _truth(t: Array, p: Array, q: Array) -> Run:
-    R = Rotation.from_quat(q).as_matrix()
-    return Run({"t": t, "p_world_base": p, "q_world_base_xyzw": q, "yaw": np.arctan2(R[:, 1, 0], R[:, 0, 0])})
+def _truth(t: Array, p: Array, q: Array) -> Truth:
+    return Truth(t, np.column_stack([p[:, :2], np.unwrap(yaw_from_quat(q))]))

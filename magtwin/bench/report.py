@@ -3,11 +3,10 @@
 import math
 import os
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import MISSING, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
-from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
 from magtwin.bench.leaderboard import Columns, Difference, Standing, compare_rows, standings
@@ -17,7 +16,6 @@ from magtwin.bench.suite import Scenario
 from magtwin.figures.canvas import (
     WIDTH_IN,
     Picture,
-    colour_bar,
     label,
     legend_below,
     new_figure,
@@ -25,14 +23,12 @@ from magtwin.figures.canvas import (
     picture,
 )
 from magtwin.figures.evaluations import INKS
-from magtwin.figures.page import Page, Section, Table, write_page, write_pages
+from magtwin.figures.page import Page, Section, Table, write_pages
 from magtwin.files.outputs import check_free
 from magtwin.report.report import Report
 
 Array = NDArray[np.float64]
 
-CELL_M = 0.25  # Side of the cells in which errors are averaged over the floor [m]
-MOST_PANELS = 6  # Localizers in one figure of floors
 LEAST_M, MOST_M = 0.01, 5.0  # Range of errors in figures [m]
 BOUND_INK = "0.35"
 
@@ -82,29 +78,17 @@ def report_results(
     write_pages(page, out, NAME, force=force)
 
 
-def compare_results(
-    a: str | os.PathLike[str],
-    b: str | os.PathLike[str],
-    out: str | os.PathLike[str] | None = None,
-    *,
-    force: bool = False,
-) -> Report:
+def compare_results(a: str | os.PathLike[str], b: str | os.PathLike[str]) -> Report:
     """Compare two results of one suite, run by run.
 
     Args:
         a: Folder of results.
         b: Folder of other results.
-        out: Page to write: .html, .md or .json. None: none.
-        force: Whether to replace an existing page.
 
     Raises:
-        InputError: A folder holds no results, they share no run, or `out` exists.
+        InputError: A folder holds no results, or they share no run.
     """
-    if out is not None:
-        check_free(out, force=force)
     first, second = read_results(a), read_results(b)
-    if out is not None:
-        write_page(page_of_comparison(first.rows, second.rows, (str(a), str(b))), out, force=force)
     lines = {}
     for d in compare_rows(first.rows, second.rows):
         lines[f"{d.scenario}, {d.a}"] = (
@@ -140,14 +124,12 @@ def page_of_results(
     all_of_them = standings(rows, times, compensated)
     names = list(dict.fromkeys(s.localizer for s in all_of_them))
     inks = {name: INKS[k % len(INKS)] for k, name in enumerate(names)}
-    sections = [
-        Section("Leaderboard", _lead(rows), _overview_pictures(all_of_them, inks), (_overview(all_of_them),))
-    ]
+    sections = [Section("Leaderboard", _lead(rows), (), (_overview(all_of_them),))]
     for scenario in dict.fromkeys(s.scenario for s in all_of_them):
         here = [s for s in all_of_them if s.scenario == scenario]
         mine = [t for t in tracks if t["scenario"] == scenario]
         causal = {s.localizer for s in here} - {*compensated, *rows["localizer"][rows["smoother"]].tolist()}
-        pictures = [_cdf(here, rows, inks), _floor(here, mine), _over_time(here, mine, inks, causal)]
+        pictures = [_cdf(here, rows, inks), _over_time(here, mine, inks, causal)]
         best = _best(here)
         tables = [_accuracy(here), _reliability(here)]
         if best is not None and len(here) > 1:
@@ -167,27 +149,6 @@ def page_of_results(
     return Page(title, origin, tuple(sections), data={"standings": [_plain(s) for s in all_of_them]})
 
 
-def page_of_comparison(a: Columns, b: Columns, names: tuple[str, str]) -> Page:
-    """Two results of one suite, run by run.
-
-    Args:
-        a: Rows of the first results.
-        b: Rows of the second.
-        names: Names of the two.
-
-    Raises:
-        InputError: They share no run.
-    """
-    found = compare_rows(a, b)
-    lead = f"A: {names[0]}. B: {names[1]}. Differences of the RMSE on the same runs, A minus B."
-    return Page(
-        "Comparison of benchmarks",
-        lead,
-        (Section("By localizer", "", (), (_differences(found),)),),
-        data={"differences": [_plain(d) for d in found]},
-    )
-
-
 def _described(scenario: Scenario, here: Sequence[Standing], rows: Columns) -> str:
     """A scenario in words, with the runs and sessions that are in the results."""
     counts = [s.runs for s in here]
@@ -199,55 +160,26 @@ def _described(scenario: Scenario, here: Sequence[Standing], rows: Columns) -> s
 
 
 def describe(scenario: Scenario) -> str:
-    """A scenario in words."""
-    starts = {
-        "tracking": "The start is known to 0.1 m and 5 deg.",
-        "heading": "The start is unknown, its heading is known within 10 deg.",
-        "global": "Position and heading at the start are unknown.",
-    }
-    runs = _count(scenario.runs, "run")
-    if scenario.source != "twin":
-        parts = [f"{runs} on recorded data: {scenario.source}, recording {scenario.number}."]
-        if scenario.source == "magnetic-data":
-            parts += [f"{scenario.rate_hz:g} readings per second.", starts[scenario.prior]]
-        if scenario.odometry_factor != 1:
-            parts.append(f"The noise of the odometry is {scenario.odometry_factor:g} times as large.")
-        if scenario.source == "1d":
-            parts.append("No true pose: errors are differences from the telephone's own visual tracking.")
-        elif scenario.runs > 1:
-            parts.append("Runs differ in the errors of odometry and start only; so do the intervals.")
-        return " ".join(parts)
-    sessions = _count(min(scenario.runs, scenario.sessions), "session")
-    parts = [
-        f"{runs} of {scenario.duration_s:g} s in {sessions}, {scenario.rate_hz:g} readings per second.",
-        starts[scenario.prior],
-    ]
-    if scenario.truth == "map":
-        sensor = scenario.sensor
-        parts.append(
-            f"Readings: the map, {sensor.white_nt:g} nT white noise, {sensor.drift_nt:g} nT drift over "
-            f"{sensor.drift_s:g} s, an offset of {sensor.offset_nt:g} nT"
-            + (f", and {sensor.iron_nt:g} nT of iron that turns with the robot." if sensor.iron_nt else ".")
-        )
-    else:
-        parts.append("Readings: the simulated robot's, with its iron of the session, motors and LiDAR.")
-    maps = {"exact": "Map: exact.", "none": "No map.", "trilinear": "Map: trilinear, of a sparse survey."}
-    surveyed = scenario.belief == "exact" and scenario.truth == "scene"
-    known = "Map: surveyed." if surveyed else maps[scenario.belief]
-    if scenario.map_error_nt:
-        known = f"Map: with an error of {scenario.map_error_nt:g} nT, alike over {scenario.map_length_m:g} m."
-    parts.append(known)
-    if scenario.kidnaps:
-        parts.append(f"The robot is put elsewhere {scenario.kidnaps} times.")
-    if scenario.stuck_s:
-        parts.append(f"The sensor repeats one value for {scenario.stuck_s:g} s.")
-    if scenario.offset_s:
-        parts.append(f"Readings are {scenario.offset_s:g} s late, which nobody is told.")
-    if any(scenario.lever_error_m):
-        parts.append("The sensor is not where the robot's description says.")
-    if scenario.moved_nt:
-        parts.append(f"An object of {scenario.moved_nt:g} nT was moved after the survey.")
-    return " ".join(parts)
+    """A scenario in words: its size, and the keys of a suite that differ from their defaults."""
+    size = f"{_count(scenario.runs, 'run')} of recorded data."
+    if scenario.source == "twin":
+        sessions = _count(min(scenario.runs, scenario.sessions), "session")
+        size = f"{_count(scenario.runs, 'run')} of {scenario.duration_s:g} s in {sessions}."
+    keys = [key for key in _changed(scenario) if key[0] not in ("name", "runs", "sessions", "duration_s")]
+    return size + (f" Set: {', '.join(f'{name} {value}' for name, value in keys)}." if keys else "")
+
+
+def _changed(settings: Any, prefix: str = "") -> list[tuple[str, Any]]:
+    """Names and values of the fields that differ from their defaults."""
+    found = []
+    for each in fields(settings):
+        value = getattr(settings, each.name)
+        default = each.default_factory() if each.default_factory is not MISSING else each.default
+        if is_dataclass(value):
+            found += _changed(value, f"{each.name}.")
+        elif value != default:
+            found.append((prefix + each.name, value))
+    return found
 
 
 def _lead(rows: Columns) -> str:
@@ -369,39 +301,6 @@ def _failures(rows: Columns, scenario: str) -> Table | None:
     return Table("Failures", ("localizer", "runs", "reason"), tuple((k[0], n, k[1]) for k, n in found))
 
 
-def _overview_pictures(every: Sequence[Standing], inks: Mapping[str, str]) -> tuple[Picture, ...]:
-    """Ratio of RMSE to the bound, a point per localizer and scenario."""
-    known = [s for s in every if s.ratio > 0]
-    if not known:
-        return ()
-    scenarios = list(dict.fromkeys(s.scenario for s in known))
-    figure = new_figure(WIDTH_IN, 1.2 + 0.45 * len(scenarios))
-    ax = figure.subplots()
-    for name in dict.fromkeys(s.localizer for s in known):
-        mine = [s for s in known if s.localizer == name]
-        ax.plot(
-            [s.ratio for s in mine],
-            [scenarios.index(s.scenario) for s in mine],
-            "o",
-            ms=7,
-            color=inks[name],
-            alpha=0.85,
-            label=name,
-        )
-    ax.axvline(1, color=BOUND_INK, lw=1, ls="--")
-    ax.set_xscale("log")
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-    ax.xaxis.set_minor_formatter(FuncFormatter(lambda v, _: f"{v:g}" if f"{v:e}"[0] in "25" else ""))
-    ax.set_yticks(range(len(scenarios)), scenarios)
-    ax.set_ylim(len(scenarios) - 0.5, -0.5)
-    ax.grid(axis="x", color="0.9", lw=0.6)
-    label(ax, "RMSE / bound (1 is the bound)")
-    ax.tick_params(which="minor", labelsize=8)
-    open_frame(ax)
-    legend_below(figure)
-    return (picture(figure, "RMSE of each localizer divided by its own bound", file="ratios"),)
-
-
 def _cdf(here: Sequence[Standing], rows: Columns, inks: Mapping[str, str]) -> Picture | None:
     figure = new_figure(WIDTH_IN / 2 + 0.6, 3.4)
     ax = figure.subplots()
@@ -476,57 +375,6 @@ def _over_time(
     return picture(figure, text, file=f"{here[0].scenario}_time")
 
 
-def _floor(here: Sequence[Standing], tracks: Sequence[Mapping[str, Any]]) -> Picture | None:
-    """Root mean square error over the floor, a panel per localizer, best first."""
-    known = sorted((s for s in here if s.rmse_m), key=lambda s: s.rmse_m.value if s.rmse_m else math.inf)
-    known = known[:MOST_PANELS]
-    places = [(t["x"], t["y"]) for t in tracks]
-    if not known or not places:
-        return None
-    x, y = (np.concatenate([p[k] for p in places]) for k in (0, 1))
-    x0, y0 = np.floor(x.min() / CELL_M) * CELL_M, np.floor(y.min() / CELL_M) * CELL_M
-    edges = [np.arange(low, high + CELL_M, CELL_M) for low, high in ((x0, x.max()), (y0, y.max()))]
-    if min(map(len, edges)) < 2:
-        return None
-    columns = min(3, len(known))
-    lines = -(-len(known) // columns)
-    tall = (edges[1][-1] - edges[1][0]) / (edges[0][-1] - edges[0][0])
-    figure = new_figure(WIDTH_IN, min((WIDTH_IN - 1) / columns * tall + 0.6, 4.5) * lines + 0.4)
-    axes = np.atleast_1d(figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).ravel())
-    drawn = None
-    for k, (ax, s) in enumerate(zip(axes, known, strict=False)):
-        mine = [t for t in tracks if t["localizer"] == s.localizer]
-        parts = {
-            name: np.concatenate([t[name] for t in mine]).astype(float) for name in ("x", "y", "error_m")
-        }
-        good = np.isfinite(parts["error_m"])
-        weights = np.square(parts["error_m"][good])
-        places_of = (parts["y"][good], parts["x"][good])
-        total, *_ = np.histogram2d(*places_of, bins=(edges[1], edges[0]), weights=weights)
-        count, *_ = np.histogram2d(*places_of, bins=(edges[1], edges[0]))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            layer = np.sqrt(total / count)
-        drawn = ax.pcolormesh(
-            edges[0], edges[1], np.ma.masked_invalid(layer), cmap="magma_r", norm="log", vmin=0.02, vmax=2.0
-        )
-        ax.set_aspect("equal")
-        ax.tick_params(labelbottom=k >= len(known) - columns)
-        label(
-            ax,
-            "x [m]" if k >= len(known) - columns else "",
-            "y [m]" if k % columns == 0 else "",
-            title=s.localizer,
-        )
-    for ax in axes[len(known) :]:
-        ax.set_axis_off()
-    if drawn is not None:
-        colour_bar(figure, drawn, axes.tolist(), "RMS error [m]", format=FuncFormatter(lambda v, _: f"{v:g}"))
-    scenario = here[0].scenario
-    return picture(
-        figure, f"{scenario}: position error over the floor, the best localizers", file=f"{scenario}_floor"
-    )
-
-
 def _stacked(tracks: Sequence[Mapping[str, Any]], name: str) -> Array | None:
     """Values over time of all runs, shape (runs, N), nan after the end of shorter ones."""
     if not tracks:
@@ -581,7 +429,7 @@ def _percent(value: float) -> str:
     return "" if math.isnan(value) else f"{100 * value:.0f} %"
 
 
-def _plain(value: Standing | Difference) -> dict[str, Any]:
+def _plain(value: Standing) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for name, entry in vars(value).items():
         out[name] = entry._asdict() if hasattr(entry, "_asdict") else entry

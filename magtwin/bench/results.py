@@ -101,7 +101,7 @@ class Results(Summarized):
 
         Returns:
             A table per run and localizer, in the order of the rows: scenario, localizer, run, and the float32
-            arrays t [s], error_m, bound_m, x, y and lost. [] if the benchmark kept none.
+            arrays t [s], error_m, bound_m and lost. [] if the benchmark kept none.
 
         Raises:
             InputError: There is no such scenario or localizer.
@@ -114,7 +114,7 @@ class Results(Summarized):
         made: dict[Run, dict[str, Any]] = {}
         for name in self.suite.scenarios if scenario is None else (scenario,):
             for file in (part for folder in self.folders for part in _parts(folder, TRACKS, name)):
-                part = _read_part(file, _KINDS[TRACKS], match)
+                part = _read_part(file, TRACKS, (*KEY, *_CURVES), match)
                 if any(len(set(map(len, row))) > 1 for row in zip(*(part[c] for c in _CURVES), strict=True)):
                     raise InputError(
                         f"{file}: damaged results (curves of unequal length); remove them and "
@@ -300,33 +300,10 @@ def write_part(
 ) -> None:
     """Write the rows of a chunk, and before them other tables of it by name: times, tracks."""
     for kind, part in (*more.items(), (ROWS, rows)):
-        table = pa.Table.from_pylist(list(part), schema=_schema(part))
+        table = pa.Table.from_pylist(list(part), schema=SCHEMAS[kind])
         sink = pa.BufferOutputStream()
         pq.write_table(table, sink, compression="zstd")
         write_file(folder / kind / scenario / name, sink.getvalue().to_pybytes())
-
-
-def _schema(rows: Sequence[Mapping[str, Any]]) -> pa.Schema:
-    """Names in the order of the rows; whole numbers, numbers, flags, texts and float32 arrays."""
-    kinds: dict[str, pa.DataType] = {}
-    for row in rows:
-        for name, value in row.items():
-            if isinstance(value, np.ndarray):
-                kind = pa.list_(pa.float32())
-            elif isinstance(value, bool | np.bool_):
-                kind = pa.bool_()
-            elif isinstance(value, int | np.integer):
-                kind = pa.int64()
-            elif isinstance(value, float | np.floating):
-                kind = pa.float64()
-            elif isinstance(value, str):
-                kind = pa.string()
-            else:
-                raise TypeError(f"column {name!r} of results: {type(value).__name__}")
-            if kind == pa.int64() and kinds.get(name) == pa.float64():
-                continue
-            kinds[name] = kind
-    return pa.schema(list(kinds.items()))
 
 
 def done_runs(folder: Path, scenarios: Iterable[str]) -> set[Run]:
@@ -335,14 +312,12 @@ def done_runs(folder: Path, scenarios: Iterable[str]) -> set[Run]:
     Raises:
         InputError: A file is damaged.
     """
-    kinds = {name: _KINDS[ROWS][name] for name in ("localizer", "run")}
     done: set[Run] = set()
     for scenario in scenarios:
         for file in _parts(folder, ROWS, scenario):
-            columns = _read_part(file, kinds)
-            done.update(
-                (scenario, *pair) for pair in zip(*(columns[name].tolist() for name in kinds), strict=True)
-            )
+            columns = _read_part(file, ROWS, KEY)
+            pairs = zip(columns["localizer"].tolist(), columns["run"].tolist(), strict=True)
+            done.update((scenario, *pair) for pair in pairs)
     return done
 
 
@@ -350,33 +325,32 @@ def _parts(folder: Path, kind: str, scenario: str) -> list[Path]:
     return sorted((folder / kind / scenario).glob("part-*.parquet"))
 
 
-def _read_part(file: Path, kinds: Mapping[str, str], filters: pc.Expression | None = None) -> Columns:
-    """The columns of a part that `kinds` names, of these kinds.
+def _read_part(file: Path, kind: str, names: Sequence[str], filters: pc.Expression | None = None) -> Columns:
+    """Some columns of a part of a kind.
 
     Raises:
         InputError: The file is damaged, or a column is missing or holds other values.
     """
     try:
-        table = load_parquet(file, partial(pq.read_table, columns=list(kinds), filters=filters))
-        if unlike := next((name for name, kind in kinds.items() if not _is(table, name, kind)), None):
-            raise InputError(f"{file}: column {unlike!r} does not hold {_WORDS[kinds[unlike]]}")
+        table = load_parquet(file, partial(pq.read_table, columns=list(names), filters=filters))
+        for name in names:
+            if table.column_names.count(name) != 1 or not _fits(table[name], SCHEMAS[kind].field(name).type):
+                raise InputError(f"{file}: column {name!r} does not hold {_WORDS[kind, name]}")
     except InputError as error:
         reason = str(error).removeprefix(f"{file}: ").partition(";")[0]
         text = f"{file}: damaged results ({reason}); remove them and repeat magtwin bench"
         raise InputError(text) from error
-    return {name: table[name].to_numpy(zero_copy_only=False) for name in kinds}
+    return {name: table[name].to_numpy(zero_copy_only=False) for name in names}
 
 
-def _is(table: pa.Table, name: str, kind: str) -> bool:
-    """Whether a table has one column of a name, of values of a kind, of which none is below 0."""
-    if table.column_names.count(name) != 1:
+def _fits(column: pa.ChunkedArray, kind: pa.DataType) -> bool:
+    """Whether a column has values of a type, none of which is missing or below 0."""
+    if column.type != kind or column.null_count:
         return False
-    column, of = table[name], table[name].type
-    number = pa.types.is_signed_integer(of) or (kind == _NUMBER and pa.types.is_floating(of))
-    if kind in _EXACT:
-        inner = column.combine_chunks().flatten() if kind == _CURVE and of == _EXACT[kind] else column
-        return bool(of == _EXACT[kind]) and not column.null_count + inner.null_count
-    return number and not column.null_count and not pc.any(pc.less(column, 0)).as_py()
+    if pa.types.is_list(kind):
+        return not column.combine_chunks().flatten().null_count
+    number = pa.types.is_integer(kind) or pa.types.is_floating(kind)
+    return not (number and pc.any(pc.less(column, 0)).as_py())
 
 
 def _order(suite: Suite) -> tuple[dict[str, int], dict[str, int]]:
@@ -391,14 +365,14 @@ def _read(folders: Sequence[Path], kind: str, order: tuple[dict[str, int], dict[
     """All rows of a kind, each run once, in the order of the suite: scenario, localizer, run."""
     scenarios, localizers = order
     parts = [
-        _read_part(file, _KINDS[kind])
+        _read_part(file, kind, SCHEMAS[kind].names)
         for folder in folders
         for name in scenarios
         for file in _parts(folder, kind, name)
     ]
     if not parts:
         return {name: np.empty(0, object) for name in (*KEY, "status")}
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in _KINDS[kind]}
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in SCHEMAS[kind].names}
     if unknown := set(columns["scenario"].tolist()) - scenarios.keys():
         raise InputError(
             f"{folders[0] / kind}: rows of scenario {min(unknown)!r}, which the suite does not have; remove "
@@ -415,34 +389,30 @@ def _read(folders: Sequence[Path], kind: str, order: tuple[dict[str, int], dict[
     return {name: values[picked] for name, values in columns.items()}
 
 
-_TEXT, _FLAG, _WHOLE, _NUMBER, _CURVE = "text", "flag", "whole number", "number", "curve"
-_EXACT = {_TEXT: pa.string(), _FLAG: pa.bool_(), _CURVE: pa.list_(pa.float32())}
+def _schema(**columns: Any) -> pa.Schema:
+    """A schema of columns that hold values like these."""
+    kinds = {str: pa.string(), bool: pa.bool_(), int: pa.int64(), list: pa.list_(pa.float32())}
+    return pa.schema([(name, kinds.get(type(value), pa.float64())) for name, value in columns.items()])
+
+
+_KEY = {"scenario": "", "localizer": "", "run": 0}
+_RUN = {"seed": 0, "session": 0, "status": "", "reason": "", "readings": 0, "smoother": False}
+_RUN |= {"global_start": False, "recovered_in_time": 0}
+_SCORES = {name: value for name, value in Scores().row().items() if name not in ("failed", "step_us")}
+_CURVES = ("t", "error_m", "bound_m", "lost")
+SCHEMAS = {
+    ROWS: _schema(**_KEY, **_RUN, **_SCORES),
+    TIMES: _schema(**_KEY, step_us=0.0),
+    TRACKS: _schema(**_KEY, **{name: [] for name in _CURVES}),
+}
+"""Columns of each kind of table."""
+
+_HOLDS = {"string": "texts", "bool": "flags", "int64": "whole numbers from 0", "double": "numbers from 0"}
 _WORDS = {
-    _TEXT: "texts",
-    _FLAG: "flags",
-    _WHOLE: "whole numbers from 0",
-    _NUMBER: "numbers from 0",
-    _CURVE: "lists of numbers",
+    (kind, each.name): _HOLDS.get(str(each.type), "lists of numbers")
+    for kind, schema in SCHEMAS.items()
+    for each in schema
 }
-
-
-def _kind(value: object) -> str:
-    """Kind of the values of a column like this one."""
-    kinds = {str: _TEXT, bool: _FLAG, int: _WHOLE}
-    return kinds.get(type(value), _NUMBER)
-
-
-_KEYS = {"scenario": _TEXT, "localizer": _TEXT, "run": _WHOLE}
-_OF_A_RUN = {
-    **dict.fromkeys(("status", "reason"), _TEXT),
-    **dict.fromkeys(("smoother", "global_start"), _FLAG),
-    **dict.fromkeys(("seed", "session", "readings", "recovered_in_time"), _WHOLE),
-}
-_SCORES = {name: _kind(value) for name, value in Scores().row().items() if name not in ("failed", "step_us")}
-_KINDS = {ROWS: {**_KEYS, **_OF_A_RUN, **_SCORES}, TIMES: {**_KEYS, "step_us": _NUMBER}}
-_CURVES = ("t", "error_m", "bound_m", "x", "y", "lost")
-_KINDS |= {TRACKS: {**_KEYS, **dict.fromkeys(_CURVES, _CURVE)}}
-"""Kinds of the columns of each kind of table; reports read them."""
 
 
 def _aligned(times: Columns, rows: Columns) -> Columns:

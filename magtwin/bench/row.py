@@ -11,18 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from magtwin.bench.case import Case, Truth
+from magtwin.bench.case import Case
 from magtwin.bench.suite import Chunk, Entry, Scenario, Suite
 from magtwin.errors import InputError
-from magtwin.field.maps.map import AnomalyMap
-from magtwin.frames import quat_from_yaw, yaw_from_quat
 from magtwin.localization.bounds import Bounds, bounds
 from magtwin.localization.localizers import load_localizer
-from magtwin.localization.problem import Localizer, Problem, SensorModel, Smoother
+from magtwin.localization.problem import Localizer, Smoother
 from magtwin.localization.scores import Scores, score
 from magtwin.localization.track import Track, track
 from magtwin.parallel import beat
-from magtwin.run.run import Run
 
 WITHIN_S = 30.0
 """Time within which a localizer must find its pose after an unknown start or a kidnapping [s]."""
@@ -34,6 +31,9 @@ SETUP = 10.0
 """Time to make a case, in time limits of a localizer: the first case opens a scene and compiles loops."""
 
 Row = dict[str, Any]
+
+_warm: set[str] = set()
+"""Localizers that this worker has compiled or loaded."""
 
 
 class TimeLimitError(BaseException):
@@ -67,6 +67,8 @@ def run_chunk(
         beat(f"{run}", times=SETUP)
         case = make_case(suite, scenario, run, fields)
         limits = bounds_of(case)
+        for name in chunk.entries:
+            _warm_up(suite.localizers[name], case)
         for name in chunk.entries:
             entry = suite.localizers[name]
             entry = replace(entry, compensator=suite.path(entry.compensator))
@@ -116,23 +118,17 @@ def make_case(suite: Suite, scenario: Scenario, run: int, fields: Path | None = 
             scenario.number,
             seed,
             start=scenario.prior,
-            odometry=scenario.odometry_model,
-            odometry_factor=scenario.odometry_factor,
+            odometry=scenario.told_odometry,
             rate_hz=scenario.rate_hz,
         )
     from magtwin.bench.magslam import HAND_LOOPS, hand_case, ship_case
 
     if scenario.source == "ship":
-        loop = ship_case(folder, scenario.number, seed)
-    elif 1 <= scenario.number <= len(HAND_LOOPS):
-        loop = hand_case(folder, HAND_LOOPS[scenario.number - 1])
-    else:
-        known = ", ".join(f"{k} ({name})" for k, name in enumerate(HAND_LOOPS, 1))
-        raise InputError(f"scenario {scenario.name!r}: number must be one of {known}, got {scenario.number}")
-    pose = np.column_stack(
-        [loop.truth["p_world_base"][:, :2], np.unwrap(yaw_from_quat(loop.truth["q_world_base_xyzw"]))]
-    )
-    return Case(loop.problem, loop.readings, Truth(loop.truth["t"], pose))
+        return ship_case(folder, scenario.number, seed)
+    if 1 <= scenario.number <= len(HAND_LOOPS):
+        return hand_case(folder, HAND_LOOPS[scenario.number - 1])
+    known = ", ".join(f"{k} ({name})" for k, name in enumerate(HAND_LOOPS, 1))
+    raise InputError(f"scenario {scenario.name!r}: number must be one of {known}, got {scenario.number}")
 
 
 def bounds_of(case: Case) -> Bounds | None:
@@ -185,27 +181,16 @@ def smooths(entry: Entry) -> bool:
     return isinstance(algorithm, Smoother) and not isinstance(algorithm, Localizer)
 
 
-def warm_up(entry: Entry) -> None:
-    """Run a localizer of magtwin on a few readings, so that no run's time has compilation in it.
+def _warm_up(entry: Entry, case: Case) -> None:
+    """Run a localizer of magtwin on a few readings once, so that no run's time has compilation in it.
 
     Localizers of others are left alone: what they do wrong counts in their runs.
     """
-    if ":" in entry.method:
+    if ":" in entry.method or repr(entry) in _warm:
         return
-    values = np.fromfunction(lambda h, j, i: 4e4 + 100 * np.sin(i) * np.cos(j), (1, 21, 21))
-    field = AnomalyMap(
-        values_nt=values,
-        variance_nt2=np.full(values.shape, 100.0),
-        origin_m=(-1.0, -1.0),
-        cell_m=(0.1, 0.1),
-        headings_rad=np.zeros(1),
-    )
-    t = np.arange(4) / 5
-    still = np.zeros((4, 3))
-    run = Run({"t": t, "odom_p": still, "odom_q_xyzw": quat_from_yaw(t * 0), "b_measured_nt": 4e4 + t})
-    problem = Problem(belief=field, extent=field.extent, sensor=SensorModel(iron_nt=100.0))
-    with contextlib.suppress(InputError):  # such as one that needs a vector field, which its runs will say
-        track(load_localizer(entry.method, entry.options), problem, run)
+    _warm.add(repr(entry))
+    with contextlib.suppress(InputError):  # which its runs will say
+        track(load_localizer(entry.method, entry.options), case.problem, case.readings.take(slice(0, 4)))
 
 
 @contextmanager
@@ -228,7 +213,7 @@ def time_limit(seconds: float) -> Iterator[None]:
 
 
 def _over_time(case: Case, made: Track | None, limits: Bounds | None) -> Row:
-    """Time, position error, bound, true place and flag at `TRACK_HZ`, as float32."""
+    """Time, position error, bound and flag at `TRACK_HZ`, as float32."""
     truth = case.truth
     every = max(1, round(case.problem.rate_hz / TRACK_HZ))
     rows = slice(None, None, every)
@@ -239,8 +224,6 @@ def _over_time(case: Case, made: Track | None, limits: Bounds | None) -> Row:
         "t": truth.t - truth.t[0],
         "error_m": error,
         "bound_m": unknown if limits is None else limits.correlated,
-        "x": truth.pose[:, 0],
-        "y": truth.pose[:, 1],
         "lost": lost,
     }
     return {name: np.asarray(values[rows], np.float32) for name, values in arrays.items()}

@@ -3,7 +3,7 @@
 import hashlib
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -11,26 +11,20 @@ from typing import Any
 
 from magtwin.bench import results
 from magtwin.bench.results import Results, Run, runs_of
-from magtwin.bench.row import SETUP, Row, run_chunk, warm_up
+from magtwin.bench.row import SETUP, Row, run_chunk
 from magtwin.bench.suite import Chunk, Seeds, Suite, load_suite, suite_file
 from magtwin.errors import InputError
 from magtwin.files.file import sha256, shipped
 from magtwin.files.outputs import output
 from magtwin.localization.compensators import is_weights
-from magtwin.parallel import Failure, Pool, beat, checked_shard, free_memory, in_shard, open_pool, processors
+from magtwin.parallel import Failure, Pool, beat, checked_shard, in_shard, open_pool
 from magtwin.version import __version__
-
-WORKER_BYTES = 500_000_000
-"""Memory of a worker: Python, its libraries, a scene with its maps, and particles."""
 
 GRACE_S = 60.0
 """Time beyond twice the suite's limit after which a worker is killed that has reported nothing: a localizer
 whose compiled code hangs does not notice the suite's limit [s]."""
 
 Progress = Callable[[int, int, str], Any]
-
-_warm: set[str] = set()
-"""Localizers that this worker has compiled or loaded."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +66,7 @@ def benchmark(
         runs: Most runs of each scenario.
         seeds: "public", or "held-out" for the final measurement.
         data: Folders of data by name.
-        jobs: Processes. Default: one for each processor, as far as memory goes.
+        jobs: Processes. Default: one for each processor.
         shard: (i, n) runs every n-th chunk, from the i-th, counted from 0. Default: all.
         dask: Address of a dask scheduler whose workers run the chunks.
         tracks: Whether to keep errors over time for the report.
@@ -98,7 +92,7 @@ def benchmark(
             text = "other shards may have written there; remove the folder yourself, and drop `force`"
             raise InputError(text, parameter="force")
     whole = whole.limited(seeds=seeds)
-    with open_pool(jobs if dask else checked_jobs(jobs), dask=dask) as pool:
+    with open_pool(jobs, dask=dask) as pool:
         if force and (out / results.ABOUT).is_file():
             shutil.rmtree(out)
         results.begin_results(out, file.read_bytes(), about(whole, chosen))
@@ -160,22 +154,8 @@ def _inputs(suite: Suite) -> dict[str, str]:
     return sums | {f"weights {name}": sha256(suite.path(name)) for name in sorted(models)}
 
 
-def checked_jobs(jobs: int | None) -> int:
-    """The number of processes, if their memory is there; default: one for each processor, if it is."""
-    free = free_memory()
-    most = processors() if free is None else max(1, free // WORKER_BYTES)
-    if jobs is None:
-        return min(processors(), most)
-    if isinstance(jobs, int) and free is not None and jobs > max(most, 1):
-        need, have = (f"{size / 1e9:.1f} GB" for size in (jobs * WORKER_BYTES, free))
-        text = f"`jobs` of {jobs} need about {need} of memory, and {have} are free; give at most {most}"
-        raise InputError(text, parameter="jobs")
-    return jobs
-
-
-def without(chunk: Chunk, done: Iterable[Run]) -> list[Chunk]:
+def without(chunk: Chunk, done: Collection[Run]) -> list[Chunk]:
     """The parts of a chunk that are not done: localizers that lack the same runs stay together."""
-    done = set(done)
     lacking: dict[tuple[int, ...], list[str]] = {}
     for name in chunk.entries:
         runs = tuple(run for run in runs_of(chunk) if (chunk.scenario, name, run) not in done)
@@ -223,10 +203,6 @@ def run_task(suite: Suite, fields: Path | None, task: Task) -> tuple[list[Row], 
         text = f"{fields}: this machine does not see the folder of results; put it where all workers do"
         raise InputError(text, parameter="out")
     beat(times=SETUP)
-    for entry in (suite.localizers[name] for name in task.chunk.entries):
-        if repr(entry) not in _warm:
-            warm_up(entry)
-            _warm.add(repr(entry))
     return run_chunk(suite, task.chunk, fields, task.failures)
 
 

@@ -12,12 +12,11 @@ from typing import Any, Literal
 
 from magtwin.errors import InputError, find
 from magtwin.files.file import existing
-from magtwin.files.kinds import expected
+from magtwin.files.kinds import expected, scene_file
 from magtwin.files.settings import from_table, read_toml, refused_at
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import OdometryModel, SensorModel
 from magtwin.sim.motion.drive_input import drive_input
-from magtwin.twin import scene_file
 
 HELD_OUT = 1_000_000_000
 """Added to the seed of the suite for the held-out seeds."""
@@ -348,8 +347,8 @@ class Suite:
                 load_localizer(entry.method, entry.options)
                 if is_weights(entry.compensator):
                     existing(self.path(entry.compensator), "weights file")
-                elif entry.compensator != "none":
-                    find("compensator", entry.compensator, COMPENSATORS)
+                else:
+                    find("compensator", entry.compensator, dict.fromkeys(COMPENSATORS))
         for scenario in self.scenario:
             with _named_in(file, "scenario", scenario.name, ("scene", "paths")):
                 if scenario.source == "twin":

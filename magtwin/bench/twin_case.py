@@ -37,6 +37,9 @@ SESSION = 7
 ROBOT = ("platform_sha256", "sensor_m", "plant", "session")
 """Metadata of a drive by which a network knows the robot of its training."""
 
+ONBOARD = ("imu_*", "odom_v", "odom_w", "battery_v", "battery_a", "lidar_on", "v_cmd", "w_cmd")
+"""Columns of a drive that localizers get besides odometry and readings."""
+
 Place = tuple[str, str]
 """Stage of a scene and its lab, as `open_twin` takes them."""
 
@@ -77,25 +80,13 @@ def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: P
         held = (t >= begin) & (t < begin + scenario.stuck_s)
         if held.any():
             b = np.where(held, b[np.argmax(held)], b)
-    keep = (
-        "imu_q_xyzw",
-        "imu_w",
-        "imu_a",
-        "odom_v",
-        "odom_w",
-        "battery_v",
-        "battery_a",
-        "lidar_on",
-        "v_cmd",
-        "w_cmd",
-    )
     readings = Run(
         {
+            **{name: values[rows] for name, values in drive.select(*ONBOARD).items()},
             "t": t,
             "odom_p": np.column_stack([odometry[:, :2], np.zeros(len(t))]),
             "odom_q_xyzw": quat_from_yaw(odometry[:, 2]),
             "b_measured_nt": b,
-            **{name: drive[name][rows] for name in keep},
         },
         {name: drive.metadata[name] for name in ROBOT if name in drive.metadata},
     )
@@ -110,8 +101,8 @@ def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: P
         calibration=_calibration(scenario, place, session),
         seed=int(rngs["localizer"].integers(2**31)),
     )
-    truth = Truth(t, pose, true_field, tuple(t[cuts].tolist()), scenario.map_error_nt)
-    return Case(problem, readings, truth, {"path": str(drive.metadata.get("path", "")), "session": session})
+    truth = Truth(t, pose, true_field, tuple(t[cuts].tolist()))
+    return Case(problem, readings, truth)
 
 
 @lru_cache(maxsize=4)
@@ -280,15 +271,5 @@ def _calibration(scenario: Scenario, place: Place, session: int) -> Run | None:
     drive = _drive(
         replace(scenario, paths=("figure8",)), place, session, session, duration_s=scenario.calibration_s
     )
-    return drive.select(
-        "p_world_base",
-        "q_world_base_xyzw",
-        "yaw",
-        "odom_*",
-        "imu_*",
-        "battery_*",
-        "lidar_on",
-        "v_cmd",
-        "w_cmd",
-        "b_measured_nt",
-    )
+    truth = ("p_world_base", "q_world_base_xyzw", "yaw", "odom_p", "odom_q_xyzw", "b_measured_nt")
+    return drive.select(*truth, *ONBOARD)

@@ -62,7 +62,7 @@ def bench(
     data
         Folders of the data that the suite needs, as NAME=FOLDER, such as ship=magslam/ship.
     jobs
-        Number of processes. Default: one for each processor, as far as memory allows.
+        Number of processes. Default: one for each processor.
     no_tracks
         Do not write the errors over time, which the report draws.
     """
@@ -92,7 +92,7 @@ def bench(
 
 @bench_app.command
 def report(*folders: Results, out: Path | None = None, force: Force = False) -> Done:
-    """Write a report on results: leaderboard, distributions of errors, errors over time and over the floor.
+    """Write a report on results: leaderboard, distributions of errors, and errors over time.
 
     The report is a folder with bench.html, which is self-contained, bench.md with its pictures, and
     bench.json.
@@ -113,7 +113,7 @@ def report(*folders: Results, out: Path | None = None, force: Force = False) -> 
 
 
 @bench_app.command
-def compare(a: Path, b: Path, *, out: Path | None = None, force: Force = False) -> Done:
+def compare(a: Path, b: Path) -> Done:
     """Compare two folders of results run by run: paired differences with intervals and p-values.
 
     Only localizers whose name is in both folders are compared.
@@ -125,9 +125,7 @@ def compare(a: Path, b: Path, *, out: Path | None = None, force: Force = False) 
     b
         Folder of results to subtract, with the same scenarios and seeds, such as those of another version of
         a localizer.
-    out
-        Page to write: .html, .md or .json. Default: none; the result is printed.
     """
     from magtwin.bench.report import compare_results
 
-    return Done(compare_results(a, b, out, force=force), wrote=out or ())
+    return Done(compare_results(a, b))

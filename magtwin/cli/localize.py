@@ -43,7 +43,7 @@ def localize(
         A run in any format that magtwin reads.
     map
         Map layer, stage, folder of survey CSVs, or the name of a scene that ships with magtwin (lab). none:
-        no map, for the methods of simultaneous localization and mapping, such as ekf-slam.
+        no map, for the methods of simultaneous localization and mapping, such as incremental-slam.
     method
         Name of a method, such as rbpf or odometry; or a class of your own as MODULE:CLASS, in the current
         folder or an installed package.
@@ -67,8 +67,8 @@ def localize(
     map_length_m
         Correlation length of the map's error that the method is told [m].
     compensator
-        Model of the robot's own field, whose prediction the method rbpf-network uses: none; iron, ridge or
-        tolles-lawson, fitted to --calibration; or the weights of a trained network (.safetensors, .pth).
+        Model of the robot's own field, whose prediction the method rbpf-network uses: none; iron,
+        fitted to --calibration; or the weights of a trained network (.safetensors, .pth).
     calibration
         Earlier run of the same session, with true poses.
     """

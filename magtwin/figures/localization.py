@@ -34,9 +34,8 @@ from magtwin.figures.canvas import (
 )
 from magtwin.figures.maps import draw_cells, mean_field_ut
 from magtwin.files.outputs import output
-from magtwin.frames import wrap_angle
+from magtwin.frames import quat_from_yaw, wrap_angle
 from magtwin.io.rerun.localization import write_localization
-from magtwin.localization.tum import save_tum
 from magtwin.tasks.localizing import Localization, truth_name
 
 ESTIMATE_INK, TRUTH_INK, DEAD_INK, BOUND_INK, LOST_INK = "#e8590c", INK, "#1971c2", "#2b8a3e", "#f3d9fa"
@@ -279,8 +278,15 @@ def save_localization(result: Localization, out: str | os.PathLike[str], *, forc
             particles=result.track.particles,
         )
         save(draw_localization(result), folder / "localize.png")
-        save_tum(folder / "estimate.tum", result.track.t, result.track.pose)
+        _save_tum(folder / "estimate.tum", result.track.t, result.track.pose)
         if result.truth is not None:
             known = np.isfinite(result.truth).all(axis=1)
-            save_tum(folder / "truth.tum", result.track.t[known], result.truth[known])
+            _save_tum(folder / "truth.tum", result.track.t[known], result.truth[known])
     return Path(out)
+
+
+def _save_tum(path: Path, t: Array, pose: Array) -> None:
+    """Write planar poses as lines `t x y z qx qy qz qw` of the TUM benchmark (Sturm et al. 2012, IROS)."""
+    table = np.column_stack([t, pose[:, :2], np.zeros(len(t)), quat_from_yaw(pose[:, 2])])
+    header = "# t [s] x y z [m] qx qy qz qw, base_link in world"
+    np.savetxt(path, table, "%.9f", header=header, comments="")

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from magtwin.errors import InputError
-from magtwin.files.file import existing
+from magtwin.errors import InputError, find
+from magtwin.files.file import existing, shipped
 
 HEAD = 1 << 16
 """Bytes that are read at the beginning and at the end of a file."""
@@ -153,6 +153,36 @@ def expected(path: str | os.PathLike[str], noun: str) -> Path:
     if kind is not None and kind not in ACCEPTED[noun]:
         raise refused(path, kind, noun)
     return path
+
+
+def scene_file(scene: str | Path) -> Path:
+    """The file of a stage, of a folder that `author_scene` wrote, or of a shipped scene's name such as "lab".
+
+    Raises:
+        InputError: The file is missing, there is no scene of that name, or it is a TOML.
+    """
+    file = Path(scene)
+    if file.suffix.lower() == ".toml" and kind_of(file) in (None, TOML, SCENE_TOML):
+        raise InputError(f"{scene}: describes a scene; author it first: magtwin scene {scene} --out FOLDER")
+    inside = file / f"{file.resolve().name}.usda"
+    if inside.is_file():
+        return inside
+    if file.suffix or file.exists() or len(file.parts) > 1:
+        return expected(file, "scene")
+    return find("scene", str(scene), _shipped_stages())
+
+
+def shipped_or(file: str | Path) -> Path:
+    """The stage of a shipped scene's name such as "lab", if there is no file of that name; else the path."""
+    path = Path(file)
+    stage = _shipped_stages().get(str(file))
+    return path if stage is None or path.exists() else stage
+
+
+def _shipped_stages() -> dict[str, Path]:
+    """Stages that ship with magtwin, by name."""
+    stages = shipped("scenes").glob("*/*.usda")
+    return {stage.stem: stage for stage in stages if stage.stem == stage.parent.name}
 
 
 def refused(path: str | os.PathLike[str], kind: Kind, noun: str) -> InputError:

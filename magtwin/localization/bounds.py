@@ -186,12 +186,12 @@ class _Path:
 
         `last` is that after the reading before, None at the start; `anew` at a start or kidnapping.
         """
-        sensor, prior, scale = self.problem.sensor, self.problem.prior, self.problem.odometry.scale_std
+        sensor, scale = self.problem.sensor, self.problem.odometry.scale_std
         x0, x1, y0, y1 = self.problem.extent
         unknown = ((x1 - x0) / math.sqrt(12), (y1 - y0) / math.sqrt(12), math.pi / math.sqrt(3))
         start = np.zeros((_STATES, _STATES))
         if last is None:
-            sd = [s if math.isfinite(s) else u for s, u in zip(prior.sd, unknown, strict=True)]
+            sd = self.problem.start[1]
             turn = self._to_state(begin)
             start[:4, :4] = turn @ np.diag(np.square([*sd, scale])) @ turn.T
             if not known:

@@ -1,46 +1,28 @@
-"""Compensators: models of the robot's own field from on-board signals, fitted to a calibration drive."""
+"""Compensators: models of the robot's own field; its iron, fitted to a calibration drive, is one."""
 
 import itertools
 import math
 from pathlib import Path
-from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from magtwin.errors import InputError
-from magtwin.extend import Registry
 from magtwin.frames import yaw_from_quat
-from magtwin.localization.problem import Array, Compensator, FieldBelief, Reading
-from magtwin.localization.readings import readings_of
+from magtwin.localization.problem import Array, FieldBelief
 from magtwin.run.run import Column, Run, numbers_in
 from magtwin.run.thinning import field_known
 
-COMPENSATORS: Registry[Any] = Registry(
-    "compensator",
-    "compensators",
-    {
-        "none": "magtwin.localization.compensators:Uncompensated",
-        "iron": "magtwin.localization.compensators:Iron",
-        "ridge": "magtwin.localization.compensators:Ridge",
-        "tolles-lawson": "magtwin.localization.compensators:TollesLawson",
-    },
-)
-"""Classes of compensators by name."""
-
-compensator = COMPENSATORS.register
-"""Decorator that gives a class a name."""
+COMPENSATORS = ("none", "iron")
+"""Names of compensators; the weights of a trained network can take their place."""
 
 WEIGHTS = (".safetensors", ".pth")
-"""Suffixes of a trained network's weights, which can take the place of a compensator's name."""
+"""Suffixes of a trained network's weights."""
 
 DISTURBANCE_COLUMNS = {
     "disturbance_nt": Column("nT", "", "the robot's own field as predicted by a compensator"),
     "disturbance_sd_nt": Column("nT", "", "standard deviation of that prediction"),
 }
-"""Columns that `compensated` adds."""
-
-PENALTIES = np.logspace(-8, 1, 19)
-"""Ridge penalties of the cross-validation, for columns of unit mean square."""
+"""Columns of a prediction."""
 
 TIMES_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """Correlation times of the errors that are tried [s]."""
@@ -48,166 +30,8 @@ TIMES_S = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 SHARES = (0.5, 0.8, 0.9, 0.95, 0.98)
 """Shares of correlated errors in their variance that are tried."""
 
-MOST_ROWS = 400
-"""Most readings of a fit, evenly from the drive: errors are alike at neighbouring ones."""
-
-FOLDS = 8
-"""Stretches of the drive for the cross-validation."""
-
-
-class Uncompensated:
-    """No compensation: the disturbance is 0."""
-
-    def fit(self, run: Run, field: FieldBelief) -> Self:
-        """Nothing to learn."""
-        return self
-
-    def step(self, reading: Reading) -> tuple[float, float]:
-        """0 and 0."""
-        return 0.0, 0.0
-
-
-class Linear:
-    """A disturbance that is linear in functions of the on-board signals, plus an offset.
-
-        d = c_0 + sum_i c_i f_i,  fitted to measured minus map on a drive with true poses
-
-    by generalised least squares: the errors are white noise and a first-order Gauss-Markov process, whose
-    variances and correlation time maximise the restricted likelihood (Patterson and Thompson 1971, Biometrika
-    58:545). Coefficients of standardised f_i are shrunk with the penalty of the best prediction of each of
-    eight stretches of the drive from the others. The standard deviation of d is that of the coefficients.
-    The errors of the readings themselves are part of the `SensorModel`.
-    """
-
-    needs: ClassVar[tuple[str, ...]] = ()
-    """Columns of the signals."""
-
-    shrunk: ClassVar[bool] = True
-    """Whether coefficients are shrunk; else ordinary least squares."""
-
-    def __init__(self) -> None:
-        self.coefficients: Array | None = None
-        """Offset and coefficients [nT per unit of the standardised signals], shape (1 + F,)."""
-
-        self._last: Reading | None = None
-
-    def features(self, reading: Reading, last: Reading | None) -> list[float]:
-        """The f_i of a reading; nan if a signal is missing."""
-        raise NotImplementedError
-
-    def fit(self, run: Run, field: FieldBelief) -> Self:
-        """Fit the coefficients.
-
-        Args:
-            run: A drive with the columns `p_world_base` and `yaw`, and the signals of the compensator. Its
-                metadata `sensor_m` have the position of the magnetometer in base_link.
-            field: The map.
-
-        Raises:
-            InputError: A column is missing, or the drive has too few readings at known field.
-        """
-        for name in ("p_world_base", "yaw", *self.needs):
-            if name not in run:
-                raise InputError(f"the calibration drive has no column {name!r}, which the compensator needs")
-        misfit = np.where(field_known(run), run["b_measured_nt"], np.nan) - _field_along(run, field)
-        rows, last = [], None
-        for reading in readings_of(run):
-            rows.append(self.features(reading, last))
-            last = reading
-        matrix = np.array(rows, float)
-        known = np.isfinite(misfit) & np.isfinite(matrix).all(axis=1)
-        rows_used = np.flatnonzero(known)
-        rows_used = rows_used[:: -(-len(rows_used) // MOST_ROWS) or 1]
-        t, matrix, misfit = run["t"][rows_used], matrix[rows_used], misfit[rows_used]
-        least = 3 * (matrix.shape[1] + 1)
-        if len(misfit) < least:
-            raise InputError(
-                f"the calibration drive has {len(misfit)} readings with signals and map, the compensator "
-                f"needs {least}"
-            )
-        self.mean, self.scale = matrix.mean(axis=0), matrix.std(axis=0)
-        self.scale[self.scale <= 1e-9 * (np.abs(self.mean) + 1e-300)] = (
-            np.inf
-        )  # a constant gets no coefficient
-        design = np.column_stack([np.ones(len(misfit)), (matrix - self.mean) / self.scale])
-        penalty = _best_penalty(design, misfit) if self.shrunk else 0.0
-        whitening, variance = _whitening(t, design, misfit)
-        design_w, misfit_w = whitening @ design, whitening @ misfit
-        self.coefficients = _ridge(design_w, misfit_w, penalty)
-        gram = design_w.T @ design_w
-        inverse = np.linalg.pinv(gram + _shrinkage(gram, penalty), rcond=1e-12)
-        self.covariance: Array = variance * inverse @ gram @ inverse
-        self.spread_nt = float(np.std(design[:, 1:] @ self.coefficients[1:]))
-        return self
-
-    def step(self, reading: Reading) -> tuple[float, float]:
-        """The disturbance and its standard deviation [nT]; the mean and the spread where a signal is missing.
-
-        Raises:
-            InputError: The compensator was not fitted.
-        """
-        if self.coefficients is None:
-            raise InputError(f"{type(self).__name__} was not fitted; call `fit` with a calibration drive")
-        features = np.array(self.features(reading, self._last), float)
-        self._last = reading
-        if not np.isfinite(features).all():
-            return float(self.coefficients[0]), math.hypot(self.spread_nt, math.sqrt(self.covariance[0, 0]))
-        row = np.concatenate([[1.0], (features - self.mean) / self.scale])
-        return float(row @ self.coefficients), math.sqrt(max(float(row @ self.covariance @ row), 0.0))
-
-
-class Iron(Linear):
-    """Hard iron and the part of soft iron that turns with the robot: offset + c cos(yaw) + s sin(yaw).
-
-    The heading is that of the IMU, whose zero must be the same in the calibration drive and in the run.
-    Odometry has another zero at each start.
-    """
-
-    needs = ("imu_q_xyzw",)
-    shrunk = False
-
-    def features(self, reading: Reading, last: Reading | None) -> list[float]:
-        """Cosine and sine of the heading."""
-        yaw = _heading(reading)
-        return [math.cos(yaw), math.sin(yaw)]
-
-
-class Ridge(Linear):
-    """Heading, twice the heading, speeds, acceleration of the turn, battery current and LiDAR motor."""
-
-    needs = ("imu_q_xyzw",)
-    signals: ClassVar[tuple[str, ...]] = ("v_cmd", "odom_w", "battery_a", "lidar_on")
-
-    def features(self, reading: Reading, last: Reading | None) -> list[float]:
-        """Functions of the heading, and the signals that the drive has; 0 for those that it lacks."""
-        yaw = _heading(reading)
-        made = [math.cos(yaw), math.sin(yaw), math.cos(2 * yaw), math.sin(2 * yaw)]
-        made += [float(np.ravel(reading.signals.get(name, 0.0))[0]) for name in self.signals]
-        dt = reading.t - last.t if last is not None else 0.0
-        turn = reading.odometry[2] - last.odometry[2] if last is not None else 0.0
-        return [*made, turn / dt if dt > 0 else 0.0]
-
-
-class TollesLawson(Linear):
-    """Permanent, induced and eddy terms of a vector magnetometer (Tolles and Lawson 1950; Leliak 1961).
-
-        d = sum p_i u_i + |B| sum a_ij u_i u_j + |B| sum e_ij u_i du_j/dt
-
-    with the direction u of the vector reading. Since u has length 1, the terms u_z u_z and u_z du_z/dt follow
-    from the others and are left out. The field is known, so that no band-pass is needed; derivatives are
-    backward differences.
-    """
-
-    needs = ("b_vector_measured_nt",)
-
-    def features(self, reading: Reading, last: Reading | None) -> list[float]:
-        """3 permanent, 5 induced and 8 eddy terms."""
-        b, u = _direction(reading)
-        rate = np.zeros(3)
-        if last is not None and reading.t > last.t:
-            rate = (u - _direction(last)[1]) / (reading.t - last.t)
-        induced = b * np.array([u[0] * u[0], u[0] * u[1], u[0] * u[2], u[1] * u[1], u[1] * u[2]])
-        return [*u.tolist(), *induced.tolist(), *(b * np.outer(u, rate).ravel()[:8]).tolist()]
+MOST_ROWS, LEAST_ROWS = 400, 9
+"""Most readings of a fit, evenly from the drive, as errors are alike at neighbouring ones; and the least."""
 
 
 def is_weights(compensator: str) -> bool:
@@ -215,16 +39,68 @@ def is_weights(compensator: str) -> bool:
     return Path(compensator).suffix.lower() in WEIGHTS
 
 
-def compensated(run: Run, fitted: Compensator) -> Run:
-    """A run with the columns `disturbance_nt` and `disturbance_sd_nt`, predicted from its on-board columns.
+def with_iron(run: Run, calibration: Run, field: FieldBelief) -> Run:
+    """A run with the columns `disturbance_nt` and `disturbance_sd_nt`, of its hard iron.
+
+        d = o + c cos(yaw) + s sin(yaw),  fitted to measured minus map on a drive with true poses
+
+    by generalised least squares: the errors are white noise and a first-order Gauss-Markov process, whose
+    variances and correlation time maximise the restricted likelihood (Patterson and Thompson 1971, Biometrika
+    58:545). The standard deviation of d is that of the coefficients; the errors of the readings themselves
+    are part of the `SensorModel`. The heading is that of the IMU, whose zero must be the same in both: the
+    odometry has another zero at each start. Without a heading, d is its mean over the drive.
 
     Args:
-        run: A run.
-        fitted: A fitted compensator. It gets a reading per row, as a localizer does.
+        run: A run with the column `imu_q_xyzw`.
+        calibration: A drive of the same session with the columns `p_world_base`, `yaw`, `imu_q_xyzw` and
+            `b_measured_nt`. Its metadata `sensor_m` have the position of the magnetometer in base_link.
+        field: The map.
+
+    Raises:
+        InputError: A column is missing, or the drive has too few readings at known field.
     """
-    made = np.array([fitted.step(reading) for reading in readings_of(run)], float).reshape(-1, 2)
-    added = run.with_columns(disturbance_nt=made[:, 0], disturbance_sd_nt=made[:, 1])
+    for name in ("p_world_base", "yaw", "imu_q_xyzw"):
+        if name not in calibration:
+            raise InputError(f"the calibration drive has no column {name!r}, which the compensator needs")
+    if "imu_q_xyzw" not in run:
+        raise InputError("the run has no column 'imu_q_xyzw', which the compensator needs")
+    misfit = np.where(field_known(calibration), calibration["b_measured_nt"], np.nan)
+    misfit = misfit - _field_along(calibration, field)
+    matrix = _turning(calibration)
+    rows = np.flatnonzero(np.isfinite(misfit) & np.isfinite(matrix).all(axis=1))
+    rows = rows[:: -(-len(rows) // MOST_ROWS) or 1]
+    if len(rows) < LEAST_ROWS:
+        raise InputError(
+            f"the calibration drive has {len(rows)} readings with signals and map, the compensator needs "
+            f"{LEAST_ROWS}"
+        )
+    t, matrix, misfit = calibration["t"][rows], matrix[rows], misfit[rows]
+    mean, scale = matrix.mean(axis=0), matrix.std(axis=0)
+    scale[scale <= 1e-9 * (np.abs(mean) + 1e-300)] = np.inf  # a constant gets no coefficient
+    design = np.column_stack([np.ones(len(misfit)), (matrix - mean) / scale])
+    whitening, variance = _whitening(t, design, misfit)
+    white = whitening @ design
+    gram = white.T @ white
+    coefficients = np.linalg.lstsq(gram, white.T @ (whitening @ misfit), rcond=1e-12)[0]
+    inverse = np.linalg.pinv(gram, rcond=1e-12)
+    covariance = variance * inverse @ gram @ inverse
+    spread = float(np.std(design[:, 1:] @ coefficients[1:]))
+
+    turning = (_turning(run) - mean) / scale
+    known = np.isfinite(turning).all(axis=1)
+    row = np.column_stack([np.ones(run.rows), np.where(known[:, None], turning, 0.0)])
+    squares = np.maximum(np.einsum("ni,ij,nj->n", row, covariance, row), 0.0)
+    added = run.with_columns(
+        disturbance_nt=np.einsum("ni,i->n", row, coefficients),
+        disturbance_sd_nt=np.sqrt(np.where(known, squares, squares + spread**2)),
+    )
     return added.with_specs(**DISTURBANCE_COLUMNS)
+
+
+def _turning(run: Run) -> Array:
+    """Cosine and sine of the IMU's heading, shape (N, 2)."""
+    yaw = yaw_from_quat(run["imu_q_xyzw"])
+    return np.column_stack([np.cos(yaw), np.sin(yaw)])
 
 
 def _field_along(run: Run, field: FieldBelief) -> Array:
@@ -234,43 +110,6 @@ def _field_along(run: Run, field: FieldBelief) -> Array:
     c, s = np.cos(yaw), np.sin(yaw)
     p = run["p_world_base"][:, :2] + np.column_stack([c * lx - s * ly, s * lx + c * ly])
     return np.asarray(field.mean(p, yaw), float)
-
-
-def _heading(reading: Reading) -> float:
-    """Heading of the IMU; nan if it is missing."""
-    quaternion = reading.signals.get("imu_q_xyzw")
-    return math.nan if quaternion is None else float(yaw_from_quat(np.asarray(quaternion, float)))
-
-
-def _direction(reading: Reading) -> tuple[float, Array]:
-    vector = np.asarray(reading.signals.get("b_vector_measured_nt", np.full(3, np.nan)), float)
-    b = float(np.linalg.norm(vector))
-    return b, vector / b if b > 0 else np.full(3, np.nan)
-
-
-def _shrinkage(gram: Array, penalty: float) -> Array:
-    """Penalty relative to the mean squares of all columns but the first."""
-    shrink = penalty * np.diag(gram).copy()
-    shrink[0] = 0.0
-    return np.diag(shrink)
-
-
-def _ridge(design: Array, y: Array, penalty: float) -> Array:
-    """Least squares with a penalty on all coefficients but the first."""
-    gram = design.T @ design
-    return np.asarray(np.linalg.lstsq(gram + _shrinkage(gram, penalty), design.T @ y, rcond=1e-12)[0], float)
-
-
-def _best_penalty(design: Array, y: Array) -> float:
-    """The penalty that best predicts each stretch of the drive from the others."""
-    stretches = np.array_split(np.arange(len(y)), FOLDS)
-    errors = np.zeros(len(PENALTIES))
-    for stretch in stretches:
-        rest = np.setdiff1d(np.arange(len(y)), stretch)
-        for k, penalty in enumerate(PENALTIES):
-            c = _ridge(design[rest], y[rest], penalty)
-            errors[k] += np.sum((y[stretch] - design[stretch] @ c) ** 2)
-    return float(PENALTIES[np.argmin(errors)])
 
 
 def _whitening(t: Array, design: Array, y: Array) -> tuple[Array, float]:

@@ -7,20 +7,20 @@ import numpy as np
 from magtwin.errors import InputError
 from magtwin.field.maps.trilinear import sd_at
 from magtwin.localization.belief import Table, as_map, mean_variance, tempering
-from magtwin.localization.odometry import increment
+from magtwin.localization.odometry import Repeats, increment
 from magtwin.localization.problem import Array, Estimate, Problem, Reading
 
 SETTLED_M = 0.5
 """Standard deviation of the position, sqrt(var x + var y), below which it counts as known [m]."""
 
-STILL_M = 1e-3
-"""Motion, in metres and in radians / 10, within which a reading may repeat itself to the bit."""
+MAP_CORRELATED = 0.8
+"""Share of the map's variance that is correlated; the rest is white."""
 
 X, Y, YAW, SCALE, OFFSET = range(5)
 
 
 class Ekf:
-    """Extended Kalman filter, iterated (Bar-Shalom, Li and Kirubarajan 2001, sections 10.3 and 10.5).
+    """Extended Kalman filter (Bar-Shalom, Li and Kirubarajan 2001, sections 10.3 and 10.5).
 
     The state is x, y, yaw, the scale error of the odometry, the offset of the magnetometer and, where the
     problem has them, its drift (FOGM over time), hard iron c cos(yaw) + s sin(yaw), and the map's error (FOGM
@@ -29,36 +29,13 @@ class Ekf:
         nu = b - B(p + R(yaw) l, yaw) - offset - drift - c cos(yaw) - s sin(yaw) - sd(p) e
         S = h P h' + R,  x' = x + P h' nu / S,  P' = (I - K h) P (I - K h)' + K R K'
 
-    repeated at x' (Gauss-Newton). It follows one mode only: it needs a prior of about the size of the
+    It follows one mode only: it needs a prior of about the size of the
     features of the field, and cannot start globally, where it is dead reckoning from the middle of the floor.
     Off the map it only predicts. A reading that repeats itself to the bit while the robot moves is not used.
 
     `lost` is set while the position has a standard deviation above 0.5 m, and once the readings contradict
     the state: the mean of nu^2 / S over about 5 s is above 4.
-
-    Args:
-        iterations: Linearisations of an update, at least 1. The gradient of a trilinear map jumps between
-            cells, and more than one did not help on such maps.
-        gate: Readings with nu^2 / S above this are not used. Default: none.
-        map_correlated: Share of the map's variance that is correlated; the rest is white.
-        kappa: Factor of the white variance, above 1 for a map whose errors depend on each other more than
-            their model. Default: `magtwin.localization.belief.tempering`.
     """
-
-    def __init__(
-        self,
-        *,
-        iterations: int = 1,
-        gate: float = math.inf,
-        map_correlated: float = 0.8,
-        kappa: float | None = None,
-    ) -> None:
-        if not (iterations >= 1 and gate > 0 and 0 <= map_correlated <= 1 and (kappa is None or kappa > 0)):
-            raise InputError(
-                "iterations must be at least 1, gate and kappa above 0, map_correlated between 0 and 1, got "
-                f"{iterations}, {gate}, {kappa}, {map_correlated}"
-            )
-        self.iterations, self.gate, self.map_correlated, self.kappa = iterations, gate, map_correlated, kappa
 
     def reset(self, problem: Problem) -> None:
         """Begin at the prior's mean, with all errors of the sensors at 0.
@@ -67,17 +44,13 @@ class Ekf:
             InputError: The problem has no map.
         """
         if problem.belief is None:
-            raise InputError("the EKF needs a map; without one, use ekf-slam or slam-smoother")
+            raise InputError("the EKF needs a map; without one, use incremental-slam")
         self._problem = problem
         self._map = as_map(problem.belief, problem.extent)
         table, spreads = self._map.tables()
         self._table, self._spreads = memoryview(table.data), memoryview(spreads.data)
-        sensor, prior = problem.sensor, problem.prior
-        x0, x1, y0, y1 = problem.extent
-        wide = (x1 - x0) / math.sqrt(12), (y1 - y0) / math.sqrt(12), math.pi / math.sqrt(3)
-        sd = [s if math.isfinite(s) else w for s, w in zip(prior.sd, wide, strict=True)]
-        pose = ((x0 + x1) / 2, (y0 + y1) / 2, prior.mean[2]) if prior.is_global else prior.mean
-        self._blind = any(math.isinf(s) for s in prior.sd)
+        sensor, (pose, sd) = problem.sensor, problem.start
+        self._blind = any(map(math.isinf, problem.prior.sd))
         variances = [*(s**2 for s in sd), problem.odometry.scale_std**2, sensor.offset_nt**2]
         self._rates: list[tuple[float, float]] = [(0.0, 0.0)] * 5
         self._drift = self._iron = self._error = 0
@@ -91,10 +64,10 @@ class Ekf:
             self._rates += [(0.0, 0.0)] * 2
         tables = Table(table, spreads)
         variance = mean_variance(tables)
-        self._kappa = self.kappa or tempering(tables, sensor.white_nt)
-        if len(variance) and self.map_correlated > 0 and problem.map_length_m > 0:
+        self._kappa = tempering(tables, sensor.white_nt)
+        if len(variance):
             self._error = len(variances)
-            variances.append(self.map_correlated)
+            variances.append(MAP_CORRELATED)
             self._rates.append((0.0, 1 / problem.map_length_m))
         self._stationary = np.array(variances)
         self.state = np.array([*pose, *[0.0] * (len(variances) - 3)])
@@ -104,29 +77,21 @@ class Ekf:
         """Its covariance."""
 
         self._last: Reading | None = None
-        self._repeated_m, self._same_nt, self._surprise = 0.0, math.nan, 1.0
+        self._repeats, self._surprise = Repeats(), 1.0
 
     def step(self, reading: Reading) -> Estimate:
         """Predict by the odometry, update by the reading."""
-        moved = 0.0
+        motion = (0.0, 0.0, 0.0)
         if self._last is not None:
-            forward, left, turn = increment(self._last.odometry, reading.odometry)
-            self._predict(forward, left, turn, reading.t - self._last.t)
-            moved = math.hypot(forward, left) + 0.1 * abs(turn)
+            motion = increment(self._last.odometry, reading.odometry)
+            self._predict(*motion, reading.t - self._last.t)
         self._last = reading
-        if self._usable(reading.b_nt, moved):
+        if self._repeats.usable(reading.b_nt, motion):
             self._update(reading.b_nt, self._problem.rate_hz)
         covariance = self.covariance[:3, :3]
         x, y, yaw = self.state[:3].tolist()
         lost = math.sqrt(covariance[0, 0] + covariance[1, 1]) > SETTLED_M or self._surprise > 4 or self._blind
         return Estimate(reading.t, x, y, yaw, covariance.copy(), float(self.state[OFFSET]), lost)
-
-    def _usable(self, b_nt: float, moved: float) -> bool:
-        if b_nt == self._same_nt:
-            self._repeated_m += moved
-        else:
-            self._same_nt, self._repeated_m = b_nt, 0.0
-        return math.isfinite(b_nt) and self._repeated_m <= STILL_M
 
     def _predict(self, forward: float, left: float, turn: float, dt: float) -> None:
         z, size = self.state, len(self.state)
@@ -169,7 +134,7 @@ class Ekf:
         sd = sd_at(self._table, self._spreads, px, py, yaw, False) if len(self._spreads) else 0.0
         white = sd**2
         if self._error:
-            white *= 1 - self.map_correlated
+            white *= 1 - MAP_CORRELATED
             h[self._error] = sd
             b += z[self._error] * sd
         return float(b), h, self._kappa * (self._problem.sensor.white_nt**2 + white)
@@ -179,28 +144,13 @@ class Ekf:
         if first is None:
             return
         b, h, white = first
-        prior, z, p = self.state, self.state, self.covariance
+        p = self.covariance
         ph = p @ h
         total = float(h @ ph) + white
         nis = (b_nt - b) ** 2 / total
         self._surprise += (min(nis, 25.0) - self._surprise) / max(1.0, 5.0 * rate_hz)
-        if nis > self.gate:
-            return
-        z = prior + ph * ((b_nt - b) / total)
-        for _ in range(self.iterations - 1):
-            again = self._expected(z)
-            if again is None:
-                break
-            b, h, white = again
-            ph = p @ h
-            total = float(h @ ph) + white
-            nu = b_nt - b - float(h @ (prior - z))
-            new = prior + ph * (nu / total)
-            small = float(np.abs(new[:3] - z[:3]).max()) < 1e-5
-            z = new
-            if small:
-                break
+        self.state = self.state + ph * ((b_nt - b) / total)
         gain = ph / total
-        left = np.eye(len(z)) - np.outer(gain, h)
+        left = np.eye(len(gain)) - np.outer(gain, h)
         p = left @ p @ left.T + white * np.outer(gain, gain)
-        self.state, self.covariance = z, (p + p.T) / 2
+        self.covariance = (p + p.T) / 2

@@ -17,7 +17,6 @@ LOCALIZERS: Registry[Any] = Registry(
     {
         "bootstrap": "magtwin.localization.particles:Bootstrap",
         "ekf": "magtwin.localization.ekf:Ekf",
-        "ekf-slam": "magtwin.localization.slam.ekf_slam:EkfSlam",
         "incremental-slam": "magtwin.localization.slam.incremental_slam:IncrementalSlam",
         "odometry": "magtwin.localization.odometry:Odometry",
         "point-mass": "magtwin.localization.grid.point_mass:PointMass",

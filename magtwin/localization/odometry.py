@@ -1,13 +1,11 @@
 """Odometry: increments of the pose, and dead reckoning."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from magtwin.localization.problem import Array, Estimate, Problem, Reading
-
-MOST_SD = 1e3
-"""Standard deviation that stands for an unknown start [m, rad]."""
 
 STILL_M = 1e-3
 """Motion within which a reading may repeat itself to the bit: metres, and radians / 10."""
@@ -33,12 +31,27 @@ def increment(
     return dx * c + dy * s, dy * c - dx * s, turn
 
 
-def repeats(before: Reading | None, now: Reading) -> bool:
-    """Whether a reading equals the one before to the bit although the robot moved: the sensor is stuck."""
-    if before is None or before.b_nt != now.b_nt:
-        return False
-    forward, left, turn = increment(before.odometry, now.odometry)
-    return math.hypot(forward, left) + 0.1 * abs(turn) > STILL_M
+def moved(pose: Sequence[float] | Array, motion: Sequence[float] | Array) -> tuple[float, float, float]:
+    """A pose after a motion (forward, left, turn) of `increment`."""
+    (x, y, yaw), (forward, left, turn) = pose, motion
+    c, s = math.cos(yaw + turn / 2), math.sin(yaw + turn / 2)
+    return x + (forward * c - left * s), y + (forward * s + left * c), yaw + turn
+
+
+class Repeats:
+    """Tells the readings of a stuck sensor: equal to the bit although the robot moves."""
+
+    def __init__(self) -> None:
+        self._b_nt, self._moved = math.nan, 0.0
+
+    def usable(self, b_nt: float, motion: tuple[float, float, float]) -> bool:
+        """Whether a reading after a motion is a number, and no repeat."""
+        if b_nt == self._b_nt:
+            forward, left, turn = motion
+            self._moved += math.hypot(forward, left) + 0.1 * abs(turn)
+        else:
+            self._b_nt, self._moved = b_nt, 0.0
+        return math.isfinite(b_nt) and self._moved <= STILL_M
 
 
 class Odometry:
@@ -50,30 +63,25 @@ class Odometry:
 
     def reset(self, problem: Problem) -> None:
         """Begin at the prior's mean; in the middle of the extent where that is unknown."""
-        self._model, self._rate = problem.odometry, problem.rate_hz
-        x0, x1, y0, y1 = problem.extent
-        sd, mean = problem.prior.sd, problem.prior.mean
-        self.pose = mean if not problem.prior.is_global else ((x0 + x1) / 2, (y0 + y1) / 2, mean[2])
-        spread = [(x1 - x0) / math.sqrt(12), (y1 - y0) / math.sqrt(12), math.pi / math.sqrt(3)]
-        known = [s if math.isfinite(s) else wide for s, wide in zip(sd, spread, strict=True)]
-        self.covariance: Array = np.diag([s**2 for s in known] + [self._model.scale_std**2])
+        self._model = problem.odometry
+        self.pose, sd = problem.start
+        self.covariance: Array = np.diag([s**2 for s in sd] + [self._model.scale_std**2])
         self._last: Reading | None = None
-        self._lost = any(math.isinf(s) for s in sd)
+        self._lost = any(map(math.isinf, problem.prior.sd))
 
     def step(self, reading: Reading) -> Estimate:
         """Move by the increment since the last reading."""
         if self._last is not None:
-            forward, left, turn = increment(self._last.odometry, reading.odometry)
-            self._move(forward, left, turn, reading.t - self._last.t)
+            self._move(increment(self._last.odometry, reading.odometry), reading.t - self._last.t)
         self._last = reading
         x, y, yaw = self.pose
         return Estimate(reading.t, x, y, yaw, self.covariance[:3, :3].copy(), lost=self._lost)
 
-    def _move(self, forward: float, left: float, turn: float, dt: float) -> None:
-        x, y, yaw = self.pose
-        c, s = math.cos(yaw + turn / 2), math.sin(yaw + turn / 2)
-        dx, dy = forward * c - left * s, forward * s + left * c
-        self.pose = (x + dx, y + dy, yaw + turn)
+    def _move(self, motion: tuple[float, float, float], dt: float) -> None:
+        x, y, _ = self.pose
+        self.pose = moved(self.pose, motion)
+        forward, left, turn = motion
+        dx, dy = self.pose[0] - x, self.pose[1] - y
         f = np.eye(4)
         f[:2, 2] = -dy, dx
         f[:2, 3] = dx, dy

@@ -1,12 +1,28 @@
 """Compiled loops of the particle filters: one step of a range of blocks of particles, and resampling.
 
-Importing this module opens numba (see `magtwin.compiled`). Random numbers belong to a particle and a step,
-and sums are taken block by block, in lanes of a fixed order, so that any number of threads gives the same
-bytes. Particles are copied to memory of fixed shape, a block at a time, which the compiler needs to know that
-rows do not overlap.
+**State.** A particle is a column: the rows X, Y, YAW, SCALE, LOG_WEIGHT and WEIGHT, then the means of its n
+linear states, and their covariance P by rows of its lower triangle. `kinds` has the n linear states in
+ascending order: CONSTANT, DRIFT, COSINE, SINE, MAP_SD. A block of 256 particles is copied to `work` and back,
+which has the first six rows too, then rows for all linear states (MEAN, COVARIANCE, GAIN = P h') and for what
+lies between (C to SLOPE). Its shape is fixed, which tells the compiler that rows do not overlap.
+
+**Step.** A particle moves by the distance d (1 + s) + along_sd e1 in the direction yaw + turned / 2 +
+direction and by across_sd e2 across it, and turns by turned + yaw_sd e3. Its mean scale error s moves by
+scale_gain along_sd e1. The linear states z follow z' = decay z + noise, and a Kalman filter updates them by
+the reading, with h = (1, 1, cos(yaw), sin(yaw), the map's standard deviation):
+
+    nu = field - map - h z,  S = h P h' + white + map_white v
+    z' = z + P h' nu / S,  P' = P - P h' h P / S
+
+with v the variance of the map. log likelihood = -(nu^2 / S + log S) / 2; log weights change by it divided by
+kappa. Where the map is not known, its value is `elsewhere`, with variance `elsewhere_variance`, all white.
+
+**Same bytes.** Random numbers belong to a particle and a step, and sums are taken block by block, in lanes of
+a fixed order, so that any number of threads gives the same bytes. Importing this module opens numba.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import types
@@ -45,37 +61,56 @@ deviation."""
 
 STATES, _TRIANGLE = 5, 15
 
-_MEAN = (
-    LINEAR  # rows of the memory of a block: those of the state with all linear states, then those in between
-)
-_COVARIANCE = _MEAN + STATES
-_GAIN = _COVARIANCE + _TRIANGLE
-_FREE = _GAIN + STATES
-_ROWS = _FREE + 16
+MEAN = LINEAR
+COVARIANCE = MEAN + STATES
+GAIN = COVARIANCE + _TRIANGLE
 
-(
-    DISTANCE,
-    DIRECTION,
-    TURNED,
-    ALONG_SD,
-    ACROSS_SD,
-    YAW_SD,
-    SCALE_GAIN,
-    ARM_X,
-    ARM_Y,
-    SHIFT,
-    USED,
-    FIELD,
-    WHITE,
-    MAP_WHITE,
-    KAPPA,
-    ELSEWHERE,
-    ELSEWHERE_VARIANCE,
-    X_REF,
-    Y_REF,
-    YAW_REF,
-) = range(20)
-"""Numbers of a step, in this order in its array: see `step`."""
+C, S, E1, E2, E3, B, V, HOLE, BIG_S, MISFIT, LIKE, SD, WX, WY, WH, SLOPE = range(
+    GAIN + STATES, GAIN + STATES + 16
+)
+"""Rows of `work` after those of the linear states: cos(yaw) and sin(yaw); random numbers; field of the map,
+its variance, and its mask; S, then its inverse; nu; log likelihood; standard deviation of the map, 0 where it
+is not known; and what the lookup in the map needs."""
+
+
+class Step(NamedTuple):
+    """Numbers of a step; see the module's text."""
+
+    distance: float  # [m]
+    direction: float  # of the motion from the heading halfway [rad]
+    turned: float  # [rad]
+    along_sd: float  # noise along the motion, across it [m] and of the heading [rad]
+    across_sd: float
+    yaw_sd: float
+    scale_gain: float  # of the scale error by the noise along the motion [1/m]
+    arm_x: float  # sensor in base_link [m]
+    arm_y: float
+    shift: float  # subtracted from the log weights, so that the weights before this step add up to 1
+    used: float  # 1 if there is a reading, else 0
+    field: float  # the reading [nT]
+    white: float  # variance of its white noise [nT^2]
+    map_white: float  # share of the map's variance that is white
+    kappa: float  # divisor of the log likelihood
+    elsewhere: float  # field where the map is not known [nT]
+    elsewhere_variance: float  # its variance [nT^2]
+    x_ref: float  # pose from which the sums are taken [m, rad]
+    y_ref: float
+    yaw_ref: float
+
+
+class Table(NamedTuple):
+    """A table of the map's field, and its variance; see `magtwin.field.maps.trilinear`."""
+
+    table: Array
+    values: Array
+    masks: Array
+    variance: Array
+    """Of the nodes; of length 0 if the map has none."""
+
+    in_layer: int
+    row: np.uint64
+    up: np.uint64
+
 
 (
     TOP,
@@ -247,230 +282,282 @@ def update_five(p: Array, mean: Array, g: Array, nu: Array, inverse: Array) -> N
         p[14, n] -= u4 * g4
 
 
+@whole
+def fetch(
+    before: Array, chosen: NDArray[np.int64], start: int, m: int, count: int, work: Array,
+    places: NDArray[np.int64],
+) -> None:  # fmt: skip
+    """Copy the m particles from `start` on; the rest of the block has no weight."""
+    for k in range(before.shape[0]):
+        to = work[places[k]]
+        if chosen.shape[0] == 0:
+            source = before[k, start : start + m]  # no negative index, which would not vectorise
+            for n in range(m):
+                to[n] = source[n]
+        elif k != LOG_WEIGHT and k != WEIGHT:
+            row_before, place_before = before[k], chosen[start : start + m]
+            for n in range(m):
+                to[n] = row_before[np.uint64(place_before[n])]
+        for n in range(m, BLOCK):
+            to[n] = to[0]
+    if chosen.shape[0] > 0:
+        work[LOG_WEIGHT] = -math.log(count)
+        work[WEIGHT] = 1.0
+    work[LOG_WEIGHT, m:] = -np.inf
+    work[WEIGHT, m:] = 0.0
+
+
+@whole
+def move(work: Array, step: Step, key: np.uint64, start: int) -> None:
+    """Move the particles by the odometry and its noise."""
+    first_draw, second_draw = stream(key, 0), stream(key, 1)
+    half = step.turned / 2 + step.direction
+    for n in range(BLOCK):
+        work[E1, n], work[E2, n] = normals(first_draw, np.uint64(start) + np.uint64(n))
+    for n in range(BLOCK):
+        work[E3, n], _ = normals(second_draw, np.uint64(start) + np.uint64(n))
+    for n in range(BLOCK):
+        cos, sin = cosine_sine(centred(work[YAW, n] + half))
+        along, across = step.along_sd * work[E1, n], step.across_sd * work[E2, n]
+        far = step.distance * (1 + work[SCALE, n]) + along
+        work[X, n] += far * cos - across * sin
+        work[Y, n] += far * sin + across * cos
+        work[SCALE, n] += step.scale_gain * along
+    for n in range(BLOCK):
+        yaw = work[YAW, n] + (step.turned + step.yaw_sd * work[E3, n])
+        work[YAW, n] = yaw
+        work[C, n], work[S, n] = cosine_sine(centred(yaw))
+        work[LOG_WEIGHT, n] -= step.shift
+
+
+@whole
+def draw_errors(work: Array, noise: Array, kinds: NDArray[np.int64], key: np.uint64, start: int) -> None:
+    """Draw the noise of linear states that are sampled."""
+    for k in range(noise.shape[0]):
+        if noise[k] > 0:
+            drawn, sd, to = stream(key, 2 + k), math.sqrt(noise[k]), work[MEAN + kinds[k]]
+            for n in range(BLOCK):
+                to[n] += sd * normals(drawn, np.uint64(start) + np.uint64(n))[0]
+
+
+@whole
+def look_up(work: Array, step: Step, field: Table, q: Array, node: NDArray[np.int64], few: bool) -> None:
+    """nu, the white part of S, and the map's standard deviation at the sensor of each particle."""
+    b, v = work[B, :BLOCK], work[V, :BLOCK]
+    wx, wy, wh = work[WX, :BLOCK], work[WY, :BLOCK], work[WH, :BLOCK]
+    for n in range(BLOCK):
+        q[2 * n] = work[X, n] + step.arm_x * work[C, n] - step.arm_y * work[S, n]
+        q[2 * n + 1] = work[Y, n] + step.arm_x * work[S, n] + step.arm_y * work[C, n]
+    place(field.table, q, work[YAW, :BLOCK], False, wx, wy, wh, node)
+    climb(field.table, field.in_layer, wh, work[SLOPE, :BLOCK], node)
+    blends(field.values, field.row, field.up, node, wx, wy, wh, b)
+    if field.masks.shape[0] > 0:
+        hole, edge = work[HOLE, :BLOCK], field.table[5]
+        blends(field.masks, field.row, field.up, node, wx, wy, wh, hole)
+        for n in range(BLOCK):
+            b[n] = np.nan if hole[n] > edge else b[n]
+    if field.variance.shape[0] > 0:
+        blends(field.variance, field.row, field.up, node, wx, wy, wh, v)
+    else:
+        v[:] = 0.0
+    for n in range(BLOCK):
+        known = b[n] == b[n]
+        work[BIG_S, n] = step.white + (step.map_white * v[n] if known else step.elsewhere_variance)
+        work[SD, n] = math.sqrt(v[n]) if known else 0.0
+        away = step.field - (b[n] if known else step.elsewhere)
+        work[MISFIT, n] = away - (work[MEAN, n] + work[MEAN + 1, n])
+    if not few:
+        for n in range(BLOCK):
+            iron = work[C, n] * work[MEAN + 2, n] + work[S, n] * work[MEAN + 3, n]
+            work[MISFIT, n] -= iron + work[SD, n] * work[MEAN + 4, n]
+
+
+@whole
+def add_variance(work: Array, few: bool) -> None:
+    """Add h P h' to S."""
+    for n in range(BLOCK):
+        work[BIG_S, n] += work[GAIN, n] + work[GAIN + 1, n]
+    if not few:
+        for n in range(BLOCK):
+            iron = work[GAIN + 2, n] * work[C, n] + work[GAIN + 3, n] * work[S, n]
+            work[BIG_S, n] += iron + work[GAIN + 4, n] * work[SD, n]
+
+
+@whole
+def add_surprise(work: Array, lanes: Array) -> None:
+    """Sums of nu, nu^2 and S with the weights before the step, by lane."""
+    for k in range(LANES):
+        sum_nu = sum_nu_nu = sum_s = 0.0
+        for part in range(PARTS):
+            n = part * LANES + k
+            w_nu = work[WEIGHT, n] * work[MISFIT, n]
+            sum_nu += w_nu
+            sum_nu_nu += w_nu * work[MISFIT, n]
+            sum_s += work[WEIGHT, n] * work[BIG_S, n]
+        lanes[NU, k], lanes[NU_NU, k], lanes[PRIOR_S, k] = sum_nu, sum_nu_nu, sum_s
+
+
+@whole
+def add_plain(work: Array, lanes: Array) -> float:
+    """Sum of the weights without kappa, by lane; returns the greatest log weight without it."""
+    for n in range(BLOCK):
+        work[E1, n] = work[LOG_WEIGHT, n] + work[LIKE, n]
+    top = greatest(work[E1], lanes[TOP])
+    for n in range(BLOCK):
+        work[E1, n] = exponential(work[E1, n] - top)
+    for k in range(LANES):
+        total = 0.0
+        for part in range(PARTS):
+            total += work[E1, part * LANES + k]
+        lanes[PLAIN_SUM, k] = total
+    return top
+
+
+@whole
+def add_means(work: Array, lanes: Array) -> None:
+    """Sums of squared weights, and of weight times cos(yaw), sin(yaw) and the offset, by lane."""
+    for k in range(LANES):
+        squares = cosines = sines = offsets = 0.0
+        for part in range(PARTS):
+            n = part * LANES + k
+            w = work[WEIGHT, n]
+            squares += w * w
+            cosines += w * work[C, n]
+            sines += w * work[S, n]
+            offsets += w * work[MEAN, n]
+        lanes[SQUARES, k], lanes[COS, k], lanes[SIN, k] = squares, cosines, sines
+        lanes[OFFSET, k] = offsets
+
+
+@whole
+def weigh(
+    work: Array, p: Array, mean: Array, g: Array, kappa: float, few: bool, sampled: bool, lanes: Array
+) -> tuple[float, float]:
+    """Weigh by the reading and update the linear states; returns the greatest log weights.
+
+    These are that with kappa, and that without it, which `add_plain` gives only if kappa is not 1.
+    """
+    if not sampled:
+        add_variance(work, few)
+    add_surprise(work, lanes)
+    for n in range(BLOCK):
+        log_s = logarithm(work[BIG_S, n])
+        work[BIG_S, n] = 1 / work[BIG_S, n]
+        work[LIKE, n] = -0.5 * (work[MISFIT, n] * work[MISFIT, n] * work[BIG_S, n] + log_s)
+    if not sampled:
+        if few:
+            update_two(p, mean, g, work[MISFIT], work[BIG_S])
+        else:
+            update_five(p, mean, g, work[MISFIT], work[BIG_S])
+    plain_top = add_plain(work, lanes) if kappa != 1 else 0.0
+    for n in range(BLOCK):
+        work[LOG_WEIGHT, n] += work[LIKE, n] / kappa
+    return greatest(work[LOG_WEIGHT], lanes[TOP]), plain_top
+
+
+@whole
+def linear_places(
+    kinds: NDArray[np.int64], decay: Array, noise: Array, decays: Array, added: Array, both: Array
+) -> NDArray[np.int64]:
+    """Rows in `work` of the rows of the state; decay and noise of all linear states."""
+    size = decay.shape[0]
+    places = np.arange(LINEAR + size + size * (size + 1) // 2)
+    row = LINEAR + size
+    for k in range(size):
+        places[LINEAR + k] = MEAN + kinds[k]
+        decays[kinds[k]], added[kinds[k]] = decay[k], noise[k]
+        for i in range(k + 1):
+            places[row] = COVARIANCE + kinds[k] * (kinds[k] + 1) // 2 + kinds[i]
+            row += 1
+    for k in range(STATES):
+        for i in range(k + 1):
+            both[k * (k + 1) // 2 + i] = decays[k] * decays[i]
+    return places
+
+
 _IN, _OUT = types.Array(types.float64, 1, "C", readonly=True), types.Array(types.float64, 1, "C")
 _TABLE = types.Array(types.float64, 2, "C")
 _KINDS = types.Array(types.int64, 1, "C", readonly=True)
+_STEP = types.NamedUniTuple(types.float64, len(Step._fields), Step)
 
 
 @compiled(
-    types.int64, types.int64, types.int64, _TABLE, _KINDS, _TABLE, _TABLE, _IN, _IN, _IN, _IN, _IN, _KINDS,
+    types.int64, types.int64, types.int64, _TABLE, _KINDS, _TABLE, _TABLE, _IN, _IN, _STEP, _IN, _IN, _KINDS,
     types.uint64, types.boolean,
 )  # fmt: skip
 def step(
     first: int, last: int, count: int, before: Array, chosen: NDArray[np.int64], state: Array, sums: Array,
-    table: Array, variance: Array, numbers: Array, decay: Array, noise: Array, kinds: NDArray[np.int64],
+    table: Array, variance: Array, numbers: Step, decay: Array, noise: Array, kinds: NDArray[np.int64],
     key: np.uint64, sampled: bool,
 ) -> None:  # fmt: skip
     """Move the particles of some blocks, weigh them by a reading, and sum over each block.
-
-    A particle moves by the distance d (1 + s) + ALONG_SD e1 in the direction yaw + TURNED / 2 + DIRECTION and
-    by ACROSS_SD e2 across it, and turns by TURNED + YAW_SD e3. Its mean scale error s moves by SCALE_GAIN
-    ALONG_SD e1. The linear states z of covariance P follow z' = decay z + noise, and a Kalman filter updates
-    them by the reading:
-
-        nu = FIELD - map - h z,  S = h P h' + WHITE + MAP_WHITE v
-        z' = z + P h' nu / S,  P' = P - P h' h P / S
-
-    with v the variance of the map. log likelihood = -(nu^2 / S + log S) / 2; log weights change by it divided
-    by KAPPA. Where the map is not known, its value is ELSEWHERE, with variance ELSEWHERE_VARIANCE, all white.
 
     Args:
         first: First block.
         last: Block after the last.
         count: Number of particles.
-        before: Particles before the step, one per column, with the rows X, Y, ...
+        before: Particles before the step, one per column.
         chosen: After resampling, the column in `before` of each particle, which all weigh the same; else of
             length 0.
         state: Takes the particles, at least `count` columns. Without `chosen` it may be `before`.
         sums: Takes the sums of each block, shape (blocks, 20).
-        table: Table of the map's field; see `magtwin.field.maps.trilinear`.
+        table: Table of the map's field.
         variance: Variance of the nodes, laid out as the values of the table; of length 0 if it has none.
-        numbers: The numbers DISTANCE, ... of the step. USED is 0 if there is no reading. SHIFT is subtracted
-            from the log weights, so that the weights before this step add up to 1.
+        numbers: Numbers of the step.
         decay: Factor of each linear state, shape (n,).
         noise: Variance added to each, shape (n,).
         kinds: CONSTANT, ... for each in ascending order, shape (n,).
         key: Key of this step's random numbers.
         sampled: The linear states are not filtered but sampled: their noise is drawn, and P stays 0.
     """
-    size, inner = decay.shape[0], 0
     # Rows are wider than a block: rows a power of two apart would compete for the same cache lines
-    work, lanes = np.empty((_ROWS, BLOCK + 8)), np.empty((PLAIN_SUM + 1, LANES + 8))
-    work[_MEAN:_GAIN] = 0.0
-    places = np.zeros(STATES + _TRIANGLE, np.int64)  # rows of the linear states in `work`
-    decays, added, both = np.ones(STATES), np.zeros(STATES), np.ones(_TRIANGLE)
-    for k in range(size):
-        places[k] = k_mean = _MEAN + kinds[k]
-        decays[k_mean - _MEAN], added[k_mean - _MEAN] = decay[k], noise[k]
-        for i in range(k + 1):
-            places[size + inner] = _COVARIANCE + kinds[k] * (kinds[k] + 1) // 2 + kinds[i]
-            inner += 1
-    for k in range(STATES):
-        for i in range(k + 1):
-            both[k * (k + 1) // 2 + i] = decays[k] * decays[i]
-    few = size == 0 or kinds[size - 1] < 2
-    filtered = 2 if few else STATES
-    x, y, yaw, scale = work[X, :BLOCK], work[Y, :BLOCK], work[YAW, :BLOCK], work[SCALE, :BLOCK]
-    log_w, weight = work[LOG_WEIGHT, :BLOCK], work[WEIGHT, :BLOCK]
-    mean, p, g = work[_MEAN:_COVARIANCE], work[_COVARIANCE:_GAIN], work[_GAIN:_FREE]
-    free = work[_FREE:]
-    c, s, e1, e2 = free[0, :BLOCK], free[1, :BLOCK], free[2, :BLOCK], free[3, :BLOCK]
-    e3, b, v, hole = free[4, :BLOCK], free[5, :BLOCK], free[6, :BLOCK], free[7, :BLOCK]
-    big_s, nu, like, r = free[8, :BLOCK], free[9, :BLOCK], free[10, :BLOCK], free[11, :BLOCK]
-    wx, wy, wh, slope = free[12, :BLOCK], free[13, :BLOCK], free[14, :BLOCK], free[15, :BLOCK]
+    work, lanes = np.empty((SLOPE + 1, BLOCK + 8)), np.empty((PLAIN_SUM + 1, LANES + 8))
+    work[MEAN:C] = 0.0
     q, node = np.empty(2 * BLOCK), np.empty(BLOCK, np.int64)
+    decays, added, both = np.ones(STATES), np.zeros(STATES), np.ones(_TRIANGLE)
+    places = linear_places(kinds, decay, noise, decays, added, both)
+    few = kinds.shape[0] == 0 or kinds[kinds.shape[0] - 1] < 2
     begin, end, in_row, in_layer = planes(table)
-    values, masks = table[begin:end], table[end:]
-    row, up, edge = np.uint64(in_row), np.uint64(in_layer), table[5]
-    used, kappa = numbers[USED] > 0, numbers[KAPPA]
-    tempered = used and kappa != 1
-    distance, turned, shift = numbers[DISTANCE], numbers[TURNED], numbers[SHIFT]
-    half = turned / 2 + numbers[DIRECTION]
-    along_sd, across_sd, yaw_sd = numbers[ALONG_SD], numbers[ACROSS_SD], numbers[YAW_SD]
-    scale_gain, arm_x, arm_y = numbers[SCALE_GAIN], numbers[ARM_X], numbers[ARM_Y]
-    field, white, map_white = numbers[FIELD], numbers[WHITE], numbers[MAP_WHITE]
-    elsewhere, elsewhere_variance = numbers[ELSEWHERE], numbers[ELSEWHERE_VARIANCE]
-    x_ref, y_ref, yaw_ref = numbers[X_REF], numbers[Y_REF], numbers[YAW_REF]
-    equal = -math.log(count)
+    row, up = np.uint64(in_row), np.uint64(in_layer)
+    field = Table(table, table[begin:end], table[end:], variance, in_layer, row, up)
+    used, tempered = numbers.used > 0, numbers.used > 0 and numbers.kappa != 1
+    x, y, yaw, weight = work[X], work[Y], work[YAW], work[WEIGHT]
+    p, mean, g = work[COVARIANCE:GAIN], work[MEAN:COVARIANCE], work[GAIN:C]
+    c, s, sd, log_w, top_lane = work[C], work[S], work[SD], work[LOG_WEIGHT], lanes[TOP]
     for block in range(first, last):
         start = block * BLOCK
         m = min(start + BLOCK, count) - start
-        for k in range(LINEAR + size + inner):
-            to = work[k if k < LINEAR else places[k - LINEAR]]
-            if chosen.shape[0] == 0:
-                source = before[k, start : start + m]  # no negative index, which would not vectorise
-                for n in range(m):
-                    to[n] = source[n]
-            elif k != LOG_WEIGHT and k != WEIGHT:
-                row_before, place_before = before[k], chosen[start : start + m]
-                for n in range(m):
-                    to[n] = row_before[np.uint64(place_before[n])]
-            for n in range(m, BLOCK):
-                to[n] = to[0]
-        if chosen.shape[0] > 0:
-            log_w[:] = equal
-            weight[:] = 1.0
-        log_w[m:] = -np.inf
-        weight[m:] = 0.0
+        fetch(before, chosen, start, m, count, work, places)
         lanes[:] = 0.0
-
-        first_draw, second_draw = stream(key, 0), stream(key, 1)
-        for n in range(BLOCK):
-            e1[n], e2[n] = normals(first_draw, np.uint64(start) + np.uint64(n))
-        for n in range(BLOCK):
-            e3[n], _ = normals(second_draw, np.uint64(start) + np.uint64(n))
-        for n in range(BLOCK):
-            cos, sin = cosine_sine(centred(yaw[n] + half))
-            along, across = along_sd * e1[n], across_sd * e2[n]
-            far = distance * (1 + scale[n]) + along
-            x[n] += far * cos - across * sin
-            y[n] += far * sin + across * cos
-            scale[n] += scale_gain * along
-        for n in range(BLOCK):
-            yaw[n] += turned + yaw_sd * e3[n]
-            c[n], s[n] = cosine_sine(centred(yaw[n]))
-            log_w[n] -= shift
-        for k in range(filtered):
-            mean_k, a = mean[k], decays[k]
+        move(work, numbers, key, start)
+        for k in range(2 if few else STATES):
             for n in range(BLOCK):
-                mean_k[n] *= a
+                work[MEAN + k, n] *= decays[k]
         if sampled:
-            for k in range(size):
-                if noise[k] > 0:
-                    drawn, sd, to = stream(key, 2 + k), math.sqrt(noise[k]), mean[kinds[k]]
-                    for n in range(BLOCK):
-                        to[n] += sd * normals(drawn, np.uint64(start) + np.uint64(n))[0]
-
+            draw_errors(work, noise, kinds, key, start)
         if used:
-            for n in range(BLOCK):
-                q[2 * n] = x[n] + arm_x * c[n] - arm_y * s[n]
-                q[2 * n + 1] = y[n] + arm_x * s[n] + arm_y * c[n]
-            place(table, q, yaw, False, wx, wy, wh, node)
-            climb(table, in_layer, wh, slope, node)
-            blends(values, row, up, node, wx, wy, wh, b)
-            if masks.shape[0] > 0:
-                blends(masks, row, up, node, wx, wy, wh, hole)
-                for n in range(BLOCK):
-                    b[n] = np.nan if hole[n] > edge else b[n]
-            if variance.shape[0] > 0:
-                blends(variance, row, up, node, wx, wy, wh, v)
-            else:
-                v[:] = 0.0
-            for n in range(BLOCK):
-                known = b[n] == b[n]
-                big_s[n] = white + (map_white * v[n] if known else elsewhere_variance)
-                r[n] = math.sqrt(v[n]) if known else 0.0
-                nu[n] = field - (b[n] if known else elsewhere) - (mean[0, n] + mean[1, n])
-            if not few:
-                for n in range(BLOCK):
-                    nu[n] -= c[n] * mean[2, n] + s[n] * mean[3, n] + r[n] * mean[4, n]
+            look_up(work, numbers, field, q, node, few)
         if not sampled:
             if few:
                 predict_two(p, g, both, added)
             else:
-                predict_five(p, g, both, added, c, s, r)
-        top = greatest(log_w, lanes[TOP])
+                predict_five(p, g, both, added, c, s, sd)
         if used:
-            if not sampled:
-                for n in range(BLOCK):
-                    big_s[n] += g[0, n] + g[1, n]
-                if not few:
-                    for n in range(BLOCK):
-                        big_s[n] += g[2, n] * c[n] + g[3, n] * s[n] + g[4, n] * r[n]
-            for k in range(LANES):
-                sum_nu = sum_nu_nu = sum_s = 0.0
-                for part in range(PARTS):
-                    n = part * LANES + k
-                    w_nu = weight[n] * nu[n]
-                    sum_nu += w_nu
-                    sum_nu_nu += w_nu * nu[n]
-                    sum_s += weight[n] * big_s[n]
-                lanes[NU, k], lanes[NU_NU, k], lanes[PRIOR_S, k] = sum_nu, sum_nu_nu, sum_s
-            for n in range(BLOCK):
-                log_s = logarithm(big_s[n])
-                big_s[n] = 1 / big_s[n]
-                like[n] = -0.5 * (nu[n] * nu[n] * big_s[n] + log_s)
-            if not sampled:
-                if few:
-                    update_two(p, mean, g, nu, big_s)
-                else:
-                    update_five(p, mean, g, nu, big_s)
-            if tempered:
-                for n in range(BLOCK):
-                    e1[n] = log_w[n] + like[n]
-                plain_top = greatest(e1, lanes[TOP])
-                for n in range(BLOCK):
-                    e1[n] = exponential(e1[n] - plain_top)
-                for k in range(LANES):
-                    plain = 0.0
-                    for part in range(PARTS):
-                        plain += e1[part * LANES + k]
-                    lanes[PLAIN_SUM, k] = plain
-            for n in range(BLOCK):
-                log_w[n] += like[n] / kappa
-            top = greatest(log_w, lanes[TOP])
+            top, plain_top = weigh(work, p, mean, g, numbers.kappa, few, sampled, lanes)
+        else:
+            top, plain_top = greatest(log_w, top_lane), 0.0
         for n in range(BLOCK):
-            weight[n] = exponential(log_w[n] - top)
+            work[WEIGHT, n] = exponential(work[LOG_WEIGHT, n] - top)
+        x_ref, y_ref, yaw_ref = numbers.x_ref, numbers.y_ref, numbers.yaw_ref
         add_moments(weight, x, y, yaw, x_ref, y_ref, yaw_ref, lanes)
-        for k in range(LANES):
-            squares = cosines = sines = offsets = 0.0
-            for part in range(PARTS):
-                n = part * LANES + k
-                w = weight[n]
-                squares += w * w
-                cosines += w * c[n]
-                sines += w * s[n]
-                offsets += w * mean[0, n]
-            lanes[SQUARES, k], lanes[COS, k], lanes[SIN, k] = squares, cosines, sines
-            lanes[OFFSET, k] = offsets
+        add_means(work, lanes)
         add_up(lanes, sums[block])
         sums[block, TOP] = top
-        if tempered:
-            sums[block, PLAIN_TOP] = plain_top
-        else:
-            sums[block, PLAIN_TOP], sums[block, PLAIN_SUM] = top, sums[block, SUM]
-        for k in range(LINEAR + size + inner):
-            to, source = state[k, start : start + m], work[k if k < LINEAR else places[k - LINEAR]]
+        sums[block, PLAIN_TOP] = plain_top if tempered else top
+        if not tempered:
+            sums[block, PLAIN_SUM] = sums[block, SUM]
+        for k in range(places.shape[0]):
+            to, source = state[k, start : start + m], work[places[k]]
             for n in range(m):
                 to[n] = source[n]
 

@@ -9,10 +9,13 @@ from numpy.typing import NDArray
 from magtwin.compiled import Loops, in_threads
 from magtwin.errors import InputError
 from magtwin.localization.belief import known_values, mean_variance, table_of, tempering
-from magtwin.localization.odometry import increment
+from magtwin.localization.odometry import Repeats, increment
 from magtwin.localization.problem import Array, Estimate, Problem, Reading
 
 LOOPS = Loops("magtwin.localization.particle_loops", pays=0)
+
+MOST = 100_000
+"""Greatest number of particles."""
 
 SHARE = 16
 """Blocks of 256 particles that a thread takes at a time."""
@@ -40,9 +43,6 @@ nearby may agree with the first readings better."""
 
 SHRINK = 0.95
 """Factor of the number of particles at each reading, while there are more than enough."""
-
-STILL_M = 1e-3
-"""Motion, in metres and in radians / 10, within which a reading may repeat itself to the bit."""
 
 _STRIDE, _WORD = 0x9E3779B97F4A7C15 * 0x2545F4914F6CDD1D, (1 << 64) - 1
 
@@ -85,9 +85,6 @@ class RaoBlackwell:
 
     Args:
         particles: Least number of particles. Default: 3,000; 6,000 for the bootstrap filter.
-        per_m2: Particles per square metre of an unknown position with known heading at the start; four times
-            as many if the heading is unknown. Default: 500; 2,000 for the bootstrap filter.
-        most: Greatest number of particles.
         kappa: Divisor of the log likelihood (tempering): above 1 for a map whose errors depend on each other
             more than their model, as at a place that is passed again. Default: `tempering`.
         map_correlated: Share of the map's variance that is correlated.
@@ -105,31 +102,27 @@ class RaoBlackwell:
     iron: ClassVar[bool] = False
     network: ClassVar[bool] = False
     least: int = 3000
-    start_per_m2: float = 500.0
+    start_per_m2: ClassVar[float] = 500.0
+    """At the start, per square metre of an unknown position; four times as many if the heading is unknown."""
 
     def __init__(
         self,
         *,
         particles: int | None = None,
-        per_m2: float | None = None,
-        most: int = 100_000,
         kappa: float | None = None,
         map_correlated: float = 0.8,
         resets: bool = True,
     ) -> None:
         self.least = self.least if particles is None else particles
-        self.start_per_m2 = self.start_per_m2 if per_m2 is None else per_m2
-        if not (isinstance(self.least, int) and isinstance(most, int) and 2 <= self.least <= most):
+        if not (isinstance(self.least, int) and 2 <= self.least <= MOST):
             raise InputError(
-                f"particles must be a whole number between 2 and most = {most}, got {self.least}",
+                f"particles must be a whole number between 2 and {MOST}, got {self.least}",
                 parameter="particles",
             )
-        if not (self.start_per_m2 > 0 and (kappa is None or kappa > 0) and 0 <= map_correlated <= 1):
+        if not ((kappa is None or kappa > 0) and 0 <= map_correlated <= 1):
             raise InputError(
-                "per_m2 and kappa must be above 0 and map_correlated between 0 and 1, got "
-                f"{self.start_per_m2}, {kappa}, {map_correlated}"
+                f"kappa must be above 0 and map_correlated between 0 and 1, got {kappa}, {map_correlated}"
             )
-        self.most = most
         self.kappa, self.map_correlated, self.resets = kappa, map_correlated, resets
 
     def reset(self, problem: Problem) -> None:
@@ -139,7 +132,7 @@ class RaoBlackwell:
             InputError: The problem has no map.
         """
         if problem.belief is None:
-            raise InputError("particle filters need a map; without one, use ekf-slam or slam-smoother")
+            raise InputError("particle filters need a map; without one, use incremental-slam")
         self._loops: Any = LOOPS.open()
         self._problem = problem
         self._rng = np.random.default_rng(problem.seed)
@@ -152,16 +145,11 @@ class RaoBlackwell:
         self._kappa = self.kappa or tempering(table, sensor.white_nt)
         self._states(len(self._variance) > 0)
         self._scale_variance = problem.odometry.scale_std**2
-        self._numbers = np.zeros(20)
-        self._numbers[[self._loops.ARM_X, self._loops.ARM_Y]] = sensor.lever_arm_m
-        self._numbers[self._loops.ELSEWHERE] = self._field_mean
-        self._numbers[self._loops.ELSEWHERE_VARIANCE] = self._field_variance
-        self._numbers[self._loops.KAPPA] = self._kappa
         self.reset_count = 0
         self._doubt, self._spread_t = False, -math.inf
         self._old: Array | None = None  # moved by odometry alone since an alarm
         self._last: Reading | None = None
-        self._repeated_m, self._same_nt = 0.0, math.nan
+        self._repeats = Repeats()
         self._start(problem.prior.mean, problem.prior.sd)
 
     def _states(self, has_variance: bool) -> None:
@@ -205,7 +193,7 @@ class RaoBlackwell:
         area = (x1 - x0) * (y1 - y0) if math.isinf(sd[0]) else wide[0] * wide[1]
         turn = min(1.0, wide[2] / (2 * math.pi))
         wanted = self.start_per_m2 * area * (1 + 3 * turn)
-        count = int(min(max(wanted, MOST_TIMES * self.least), self.most))
+        count = int(min(max(wanted, MOST_TIMES * self.least), MOST))
         size = len(self._kinds)
         k = self._loops
         old = 0 if kept is None else kept.shape[1]
@@ -276,68 +264,74 @@ class RaoBlackwell:
 
     def step(self, reading: Reading) -> Estimate:
         """Move the particles, weigh them by the reading, and resample if need be."""
-        k, numbers = self._loops, self._numbers
         forward = left = turn = dt = 0.0
         if self._last is not None:
             forward, left, turn = increment(self._last.odometry, reading.odometry)
             dt = reading.t - self._last.t
         self._last = reading
-        distance = self._set_motion(forward, left, turn, dt)
-        used = self._usable(reading.b_nt, distance + 0.1 * abs(turn))
-        numbers[k.USED] = used
-        numbers[k.SHIFT] = self._shift
-        numbers[k.FIELD] = reading.b_nt - (reading.disturbance_nt if self.network else 0.0) if used else 0.0
-        extra = reading.disturbance_sd_nt**2 if self.network else 0.0
-        numbers[k.WHITE] = self._problem.sensor.white_nt**2 + extra
-        numbers[k.MAP_WHITE] = self._map_white
+        distance = math.hypot(forward, left)
+        used = self._repeats.usable(reading.b_nt, (forward, left, turn))
+        own, own_sd = (reading.disturbance_nt, reading.disturbance_sd_nt) if self.network else (0.0, 0.0)
         x, y, yaw = self._reference
         yaw += turn
         middle = yaw - turn / 2
         x += forward * math.cos(middle) - left * math.sin(middle)
         y += forward * math.sin(middle) + left * math.cos(middle)
-        numbers[k.X_REF : k.YAW_REF + 1] = x, y, yaw
+        along_sd, across_sd, yaw_sd, gain = self._motion_noise(distance, turn, dt)
+        sensor = self._problem.sensor
+        numbers = self._loops.Step(
+            distance=distance,
+            direction=math.atan2(left, forward),
+            turned=turn,
+            along_sd=along_sd,
+            across_sd=across_sd,
+            yaw_sd=yaw_sd,
+            scale_gain=gain,
+            arm_x=float(sensor.lever_arm_m[0]),
+            arm_y=float(sensor.lever_arm_m[1]),
+            shift=self._shift,
+            used=float(used),
+            field=float(reading.b_nt - own) if used else 0.0,
+            white=float(sensor.white_nt**2 + own_sd**2),
+            map_white=float(self._map_white),
+            kappa=float(self._kappa),
+            elsewhere=self._field_mean,
+            elsewhere_variance=self._field_variance,
+            x_ref=x,
+            y_ref=y,
+            yaw_ref=yaw,
+        )
         decay = np.exp(-dt * self._rates[0] - distance * self._rates[1])
         noise = self._prior_variances * (1 - decay**2)
-        self._run(decay, noise)
-        estimate = self._estimate(reading.t, used)
+        self._run(numbers, decay, noise)
+        estimate = self._estimate(reading.t, used, (x, y, yaw))
         self._maintain(estimate)
         return estimate
 
-    def _set_motion(self, forward: float, left: float, turn: float, dt: float) -> float:
-        """Numbers of the motion; the sampled distances update the variance of the scale error."""
-        k, numbers, model = self._loops, self._numbers, self._problem.odometry
-        distance = math.hypot(forward, left)
+    def _motion_noise(self, distance: float, turn: float, dt: float) -> tuple[float, float, float, float]:
+        """Standard deviations along, across and of the yaw, and gain of the scale error.
+
+        The sampled distances update the variance of the scale error.
+        """
+        model = self._problem.odometry
         along, _, yaw = model.variances(distance, turn, dt).tolist()
         total = along + distance**2 * self._scale_variance
         gain = distance * self._scale_variance / total if total > 0 else 0.0
         least = (0.1 * model.scale_std) ** 2
         self._scale_variance = max(self._scale_variance * (1 - gain * distance), least)
-        numbers[k.DISTANCE], numbers[k.DIRECTION] = distance, math.atan2(left, forward)
-        numbers[k.TURNED], numbers[k.SCALE_GAIN] = turn, gain
-        numbers[k.ALONG_SD : k.YAW_SD + 1] = math.sqrt(total), math.sqrt(along), math.sqrt(yaw)
-        return distance
+        return math.sqrt(total), math.sqrt(along), math.sqrt(yaw), gain
 
-    def _usable(self, b_nt: float, moved: float) -> bool:
-        """Whether a reading is a number and has not stood still while the robot moved."""
-        if b_nt == self._same_nt:
-            self._repeated_m += moved
-        else:
-            self._same_nt, self._repeated_m = b_nt, 0.0
-        return math.isfinite(b_nt) and self._repeated_m <= STILL_M
-
-    def _run(self, decay: Array, noise: Array) -> None:
+    def _run(self, numbers: Any, decay: Array, noise: Array) -> None:
         """One step of all blocks, on several threads if there are many; the old particles beside them."""
         self._count_steps += 1
         before = self._state
         if len(self._resampled):
             self._state = self._next_state(len(before))
-        self._sums = self._moved(before, self._resampled, self._state, self._count, decay, noise)
+        self._sums = self._moved(before, self._resampled, self._state, self._count, numbers, decay, noise)
         self._resampled = self._resampled[:0]
-        if self._old is not None:
-            old, numbers, used = self._old, self._numbers, self._numbers[self._loops.USED]
-            numbers[self._loops.USED] = 0.0
-            self._moved(old, self._resampled, old, old.shape[1], decay, noise, sign=-1)
-            numbers[self._loops.USED] = used
+        if (old := self._old) is not None:
+            alone = numbers._replace(used=0.0)
+            self._moved(old, self._resampled, old, old.shape[1], alone, decay, noise, sign=-1)
 
     def _moved(
         self,
@@ -345,6 +339,7 @@ class RaoBlackwell:
         chosen: NDArray[np.int64],
         state: Array,
         count: int,
+        numbers: Any,
         decay: Array,
         noise: Array,
         sign: int = 1,
@@ -358,14 +353,14 @@ class RaoBlackwell:
         def work(part: slice) -> None:
             k.step(
                 part.start, part.stop, count, before, chosen, state, sums, self._table, self._variance,
-                self._numbers, decay, noise, self._kinds, key, self.sampled,
+                numbers, decay, noise, self._kinds, key, self.sampled,
             )  # fmt: skip
 
         in_threads(work, blocks, SHARE)
         return sums
 
-    def _estimate(self, t: float, used: bool) -> Estimate:
-        """Weighted mean and covariance; the sum of surprise."""
+    def _estimate(self, t: float, used: bool, reference: tuple[float, float, float]) -> Estimate:
+        """Weighted mean and covariance, from sums about a reference pose; the sum of surprise."""
         k, sums = self._loops, self._sums
         top = float(sums[:, k.TOP].max())
         scales, before = np.exp(sums[:, k.TOP] - top), self._scales
@@ -374,7 +369,7 @@ class RaoBlackwell:
         self._effective = weight**2 / float(scales**2 @ sums[:, k.SQUARES])
         self._shift = top + math.log(weight)
         self._scales = scales / weight
-        x, y, yaw = self._numbers[k.X_REF : k.YAW_REF + 1].tolist()
+        x, y, yaw = reference
         part = total[k.SUM : k.YAW_YAW + 1] / weight
         mean_yaw = math.atan2(total[k.SIN], total[k.COS])
         if abs(_wrapped(mean_yaw - yaw - part[3])) > 0.05:  # the heading is spread around the circle
@@ -488,7 +483,7 @@ class RaoBlackwell:
 
     def _enough(self, spread: float) -> int:
         """Least number of particles for a spread [m]."""
-        return min(self.most, int(self.least * min(max(spread / NARROW_M, 1.0), MOST_TIMES)))
+        return min(MOST, int(self.least * min(max(spread / NARROW_M, 1.0), MOST_TIMES)))
 
     def _blocks(self, count: int) -> int:
         return -(-count // self._loops.BLOCK)

@@ -7,7 +7,7 @@ pose, the true field or a later reading. Poses are x, y [m] and yaw [rad] of bas
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -185,6 +185,15 @@ class Problem:
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"`{name}` must be above 0, got {getattr(self, name)}", parameter=name)
 
+    @property
+    def start(self) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Mean and standard deviation of the prior, or where that is infinite, of a uniform pose."""
+        (x0, x1, y0, y1), prior = self.extent, self.prior
+        wide = (x1 - x0) / math.sqrt(12), (y1 - y0) / math.sqrt(12), math.pi / math.sqrt(3)
+        x, y, yaw = (s if math.isfinite(s) else w for s, w in zip(prior.sd, wide, strict=True))
+        mean = ((x0 + x1) / 2, (y0 + y1) / 2, prior.mean[2]) if prior.is_global else prior.mean
+        return mean, (x, y, yaw)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
@@ -200,7 +209,7 @@ class Reading:
     """x, y [m] and yaw [rad] of base_link in the frame `odom`."""
 
     disturbance_nt: float = 0.0
-    """The robot's own field as predicted by a `Compensator` [nT]; 0 without one. Not yet subtracted."""
+    """The robot's own field as predicted by a compensator [nT]; 0 without one. Not yet subtracted."""
 
     disturbance_sd_nt: float = 0.0
     """Its standard deviation [nT]."""
@@ -259,19 +268,6 @@ class Smoother(Protocol):
 
     def run(self, problem: Problem, readings: Run) -> Sequence[Estimate]:
         """Estimates at the times of all readings; `readings` has only on-board columns."""
-        ...
-
-
-@runtime_checkable
-class Compensator(Protocol):
-    """A model of the robot's own field from on-board signals."""
-
-    def fit(self, run: Run, field: FieldBelief) -> Self:
-        """Learn from a drive with true poses; returns itself."""
-        ...
-
-    def step(self, reading: Reading) -> tuple[float, float]:
-        """The disturbance at a reading and its standard deviation [nT]."""
         ...
 
 

@@ -32,7 +32,7 @@ ONBOARD = (
     "disturbance_nt",
     "disturbance_sd_nt",
 )
-"""Columns that a robot knows. `disturbance_nt` and its sd come from a `Compensator`."""
+"""Columns that a robot knows. `disturbance_nt` and its sd come from a compensator."""
 
 NEEDED = ("t", "b_measured_nt", "odom_p", "odom_q_xyzw")
 

@@ -1,17 +1,17 @@
 """Smoother: all poses of a run at once, by nonlinear least squares on a factor graph with the map."""
 
 import math
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.frames import yaw_from_quat
+from magtwin.localization.arrow import Arrow
 from magtwin.localization.belief import as_map, table_of
 from magtwin.localization.grid.point_mass import PointMass
-from magtwin.localization.odometry import STILL_M, increment
-from magtwin.localization.problem import Array, Estimate, Localizer, Problem
+from magtwin.localization.odometry import STILL_M, increment, moved
+from magtwin.localization.problem import Array, Estimate, Problem
 from magtwin.localization.readings import readings_of
 from magtwin.run.run import Run
 
@@ -24,114 +24,17 @@ LEAST_SD = 1e-4
 UNKNOWN = 100.0
 """Standard deviation that stands for an infinite one in covariances [m, rad]."""
 
+ITERATIONS = 40
+"""Most steps per start."""
+
 JUMP_M = 0.5
 """Jump of the forward pass that shows that it was wrong before [m]."""
 
 SETTLES_S = 20.0
 """Time after the start of the forward pass in which such a jump may be [s]."""
 
-HUBER = 1.345
-"""Residual from which Huber's loss is linear: 95 % efficiency (Huber 1981) [standard deviations]."""
-
-GNC = 3.0
-"""Residual beyond which a factor counts as an outlier for GNC [standard deviations]."""
-
-
-class Arrow:
-    """A symmetric positive definite matrix: block tridiagonal, bordered by a few dense columns.
-
-        [ T    C ]     T: blocks D_k on the diagonal and L_k = T[k + 1, k] below it
-        [ C'   G ]
-
-    Args:
-        diagonal: D, shape (N, b, b).
-        below: L, shape (N - 1, b, b).
-        border: C, shape (N, b, g).
-        corner: G, shape (g, g).
-    """
-
-    def __init__(self, diagonal: Array, below: Array, border: Array, corner: Array) -> None:
-        self.diagonal, self.below, self.border, self.corner = diagonal, below, border, corner
-
-    def solve(self, right: Array, corner: Array) -> tuple[Array, Array]:
-        """Solve for a right-hand side (N, b) and its corner (g,), by a banded Cholesky factor.
-
-        Raises:
-            numpy.linalg.LinAlgError: The matrix is not positive definite.
-        """
-        from scipy.linalg import cho_solve_banded, cholesky_banded
-
-        n, b, g = self.border.shape
-        factor = cholesky_banded(self._banded(), lower=True, check_finite=False)
-        columns = np.concatenate([self.border, right[:, :, None]], axis=2).reshape(n * b, g + 1)
-        made = cho_solve_banded((factor, True), columns, check_finite=False)
-        flat = self.border.reshape(n * b, g)
-        schur = self.corner - flat.T @ made[:, :g]
-        last = np.linalg.solve(schur, corner - flat.T @ made[:, g])
-        return (made[:, g] - made[:, :g] @ last).reshape(n, b), last
-
-    def covariances(self) -> tuple[Array, Array]:
-        """Diagonal blocks of the inverse: (N, b, b) and (g, g), without forming the inverse.
-
-        Forward, the Schur complements S_k = D_k - L_k-1 S_k-1^-1 L_k-1'. Backward, the selected inverse of T,
-        P_k = S_k^-1 + S_k^-1 L_k' P_k+1 L_k S_k^-1 (Takahashi, Fagan and Chen 1973; the recursion of Rauch,
-        Tung and Striebel). The border adds Y_k (G - C' Y)^-1 Y_k' with Y = T^-1 C.
-        """
-        n, b, g = self.border.shape
-        inverses, made = np.empty((n, b, b)), np.empty((n, b, b))
-        y = np.empty((n, b, g))
-        right = self.border[0]
-        inverses[0] = np.linalg.inv(self.diagonal[0])
-        rights = [right]
-        for k in range(1, n):
-            gain = self.below[k - 1] @ inverses[k - 1]
-            inverses[k] = np.linalg.inv(self.diagonal[k] - gain @ self.below[k - 1].T)
-            right = self.border[k] - gain @ right
-            rights.append(right)
-        made[-1] = inverses[-1]
-        y[-1] = inverses[-1] @ rights[-1]
-        for k in range(n - 2, -1, -1):
-            gain = inverses[k] @ self.below[k].T
-            made[k] = inverses[k] + gain @ made[k + 1] @ gain.T
-            y[k] = inverses[k] @ rights[k] - gain @ y[k + 1]
-        corner = np.linalg.inv(self.corner - np.einsum("nbg,nbh->gh", self.border, y))
-        made += y @ corner @ y.transpose(0, 2, 1)
-        return 0.5 * (made + made.transpose(0, 2, 1)), 0.5 * (corner + corner.T)
-
-    def last_covariance(self) -> tuple[Array, float]:
-        """The last of the blocks of `covariances` (b, b), and the logarithm of the determinant."""
-        from scipy.linalg import cho_solve_banded, cholesky_banded
-
-        n, b, g = self.border.shape
-        factor = cholesky_banded(self._banded(), lower=True, check_finite=False)
-        ends = np.zeros((n * b, b))
-        ends[-b:] = np.eye(b)
-        columns = np.concatenate([self.border.reshape(n * b, g), ends], axis=1)
-        made = cho_solve_banded((factor, True), columns, check_finite=False)
-        y, last = made[:, :g], made[-b:, g:]
-        schur = self.corner - self.border.reshape(n * b, g).T @ y
-        covariance = last + y[-b:] @ np.linalg.solve(schur, y[-b:].T)
-        determinant = 2 * float(np.log(factor[0]).sum()) + float(np.linalg.slogdet(schur)[1])
-        return 0.5 * (covariance + covariance.T), determinant
-
-    def damped(self, factor: float) -> "Arrow":
-        """The matrix with its diagonal grown by a factor (Marquardt 1963)."""
-        _, b, g = self.border.shape
-        diagonal, corner = self.diagonal.copy(), self.corner.copy()
-        diagonal[:, range(b), range(b)] *= 1 + factor
-        corner[range(g), range(g)] *= 1 + factor
-        return Arrow(diagonal, self.below, self.border, corner)
-
-    def _banded(self) -> Array:
-        """T in the lower banded form of LAPACK, shape (2 b, N b)."""
-        n, b = self.diagonal.shape[:2]
-        band = np.zeros((2 * b, n * b))
-        for i in range(b):
-            for j in range(b):
-                if i >= j:
-                    band[i - j, j::b] = self.diagonal[:, i, j]
-                band[b + i - j, j : (n - 1) * b : b] = self.below[:, i, j]
-        return band
+UNKNOWN_SD = 3.0
+"""A reading at an unknown field costs as one so many standard deviations off."""
 
 
 class Graph:
@@ -266,44 +169,37 @@ class Graph:
         first = np.where(finite, away, 0.0) / np.where(finite, prior.sd, 1.0)
         return np.concatenate([first, common / self.common_sd])
 
-    def residuals(self, local: Array, common: Array) -> Array:
-        """All residuals, whitened: their sum of squares is twice the negative log-posterior."""
-        return np.concatenate(
-            [
-                self.fields(local, common)[0],
-                self.motions(local, common)[0].ravel(),
-                self.walks(local)[0],
-                self.prior(local, common),
-            ]
-        )
+    def cost(self, local: Array, common: Array) -> float:
+        """Sum of squares of all residuals, whitened: twice the negative log-posterior."""
+        field, _, _, known = self.fields(local, common)
+        others = np.sum(self.walks(local)[0] ** 2) + np.sum(self.prior(local, common) ** 2)
+        motion = np.sum(self.motions(local, common)[0] ** 2, axis=1)
+        unknown = self.read & ~known
+        return float(others + (np.sum(field**2) + motion.sum()) + UNKNOWN_SD**2 * unknown.sum())
 
-    def normal_equations(
-        self, local: Array, common: Array, by_field: Array, by_motion: Array
-    ) -> tuple[Arrow, Array, Array]:
-        """J' W J, and the gradient J' W r in its local and its common part, with weights of the factors."""
+    def normal_equations(self, local: Array, common: Array) -> Arrow:
+        """The system J' J x = -J' r of a Gauss-Newton step."""
         n, b, g = len(local), self.local, len(common)
         diagonal, below = np.zeros((n, b, b)), np.zeros((n - 1, b, b))
         border, corner = np.zeros((n, b, g)), np.diag(1 / self.common_sd**2)
         gradient, common_gradient = np.zeros((n, b)), common / self.common_sd**2
         r, f, c, _ = self.fields(local, common)
-        wf = f * by_field[:, None]
-        diagonal += wf[:, :, None] * f[:, None, :]
-        border += wf[:, :, None] * c[:, None, :]
-        corner += (c * by_field[:, None]).T @ c
-        gradient += wf * r[:, None]
-        common_gradient += c.T @ (by_field * r)
+        diagonal += f[:, :, None] * f[:, None, :]
+        border += f[:, :, None] * c[:, None, :]
+        corner += c.T @ c
+        gradient += f * r[:, None]
+        common_gradient += c.T @ r
         e, before, after, scale = self.motions(local, common)
-        w = by_motion[:, None, None]
-        bt, at = before.transpose(0, 2, 1) * w, after.transpose(0, 2, 1) * w
+        bt, at = before.transpose(0, 2, 1), after.transpose(0, 2, 1)
         diagonal[:-1, :3, :3] += bt @ before
         diagonal[1:, :3, :3] += at @ after
         below[:, :3, :3] += at @ before
         border[:-1, :3, 0] += (bt @ scale[:, :, None])[:, :, 0]
         border[1:, :3, 0] += (at @ scale[:, :, None])[:, :, 0]
-        corner[0, 0] += np.sum(by_motion[:, None] * scale**2)
+        corner[0, 0] += np.sum(scale**2)
         gradient[:-1, :3] += (bt @ e[:, :, None])[:, :, 0]
         gradient[1:, :3] += (at @ e[:, :, None])[:, :, 0]
-        common_gradient[0] += np.sum(by_motion[:, None] * scale * e)
+        common_gradient[0] += np.sum(scale * e)
         for column, keeps, sd in self.walks(local)[1]:
             x = local[:, column]
             inverse = 1 / sd**2
@@ -322,7 +218,8 @@ class Graph:
                 gradient[0, k] += first[k] / spread
             else:
                 diagonal[0, k, k] += 1 / UNKNOWN**2
-        return Arrow(diagonal, below, border, corner), gradient, common_gradient
+        right = np.concatenate([border, -gradient[:, :, None]], axis=2)
+        return Arrow(diagonal, below, right, corner, -common_gradient)
 
 
 class MapSmoother:
@@ -337,31 +234,7 @@ class MapSmoother:
     that a step costs O(N). It starts at the forward pass of a filter, with dead reckoning back from the time
     at which that is no longer lost, and at dead reckoning from the prior if there is one; the lower cost
     wins. The covariances are those of the linearised problem.
-
-    Args:
-        start: Localizer of the forward pass. Default: the point-mass filter.
-        robust: "huber": Huber's loss on readings and odometry; "gnc": graduated non-convexity with the loss
-            of Geman and McClure (Yang et al. 2020, IEEE RA-L 5:1127), which also ignores gross outliers;
-            None: least squares.
-        iterations: Most steps per start.
     """
-
-    def __init__(
-        self,
-        *,
-        start: Localizer | None = None,
-        robust: Literal["huber", "gnc"] | None = None,
-        iterations: int = 40,
-    ) -> None:
-        if robust not in (None, "huber", "gnc"):
-            raise InputError(
-                f'robust of MapSmoother must be "huber", "gnc" or None, got {robust!r}', parameter="robust"
-            )
-        if iterations < 1:
-            raise InputError(
-                f"iterations of MapSmoother must be at least 1, got {iterations}", parameter="iterations"
-            )
-        self._start, self._robust, self._iterations = start, robust, iterations
 
     def run(self, problem: Problem, readings: Run) -> list[Estimate]:
         """Estimates at all readings.
@@ -370,18 +243,18 @@ class MapSmoother:
             InputError: The problem has no map.
         """
         graph = Graph(problem, readings)
-        forward = self._start or PointMass()
+        forward = PointMass()
         forward.reset(problem)
         passed = [forward.step(reading) for reading in readings_of(readings)]
         lost = np.array([estimate.lost for estimate in passed])
         best = None
         for poses in self._starts(graph, passed, readings["t"]):
-            local, common, cost, weights = self.minimise(graph, *graph.start(poses))
+            local, common, cost = self.minimise(graph, *graph.start(poses))
             if best is None or cost < best[2]:
-                best = local, common, cost, weights
+                best = local, common, cost
         assert best is not None
-        local, common, _, weights = best
-        covariance, _ = graph.normal_equations(local, common, *weights)[0].covariances()
+        local, common, _ = best
+        covariance = graph.normal_equations(local, common).solve().pose_covariances()
         bias = common[1] + local[:, 3]
         return [
             Estimate(t, x, y, yaw, covariance[k, :3, :3], float(bias[k]), bool(lost[-1]))
@@ -390,77 +263,28 @@ class MapSmoother:
             )
         ]
 
-    def minimise(
-        self, graph: Graph, local: Array, common: Array
-    ) -> tuple[Array, Array, float, tuple[Array, Array]]:
-        """Levenberg-Marquardt with weights of the factors that follow the robust loss.
-
-        Returns:
-            The unknowns, the cost, and the weights of readings and of odometry.
-        """
-        looseness = 64.0 if self._robust == "gnc" else 1.0
-        damping = 1e-4
-        weights = self._weights(graph, local, common, looseness)
-        cost = self._cost(graph, local, common, looseness)
-        for _ in range(self._iterations):
-            matrix, gradient, common_gradient = graph.normal_equations(local, common, *weights)
-            before = cost
+    def minimise(self, graph: Graph, local: Array, common: Array) -> tuple[Array, Array, float]:
+        """Levenberg-Marquardt: the unknowns and the cost."""
+        damping, cost = 1e-4, graph.cost(local, common)
+        for _ in range(ITERATIONS):
+            system, before = graph.normal_equations(local, common), cost
             while damping < 1e8:
                 try:
-                    step, common_step = matrix.damped(damping).solve(-gradient, -common_gradient)
+                    step = system.damped(damping).solve()
                 except np.linalg.LinAlgError:
                     damping *= 10
                     continue
-                tried = self._cost(graph, local + step, common + common_step, looseness)
+                tried = graph.cost(local + step.x, common + step.g)
                 if tried <= cost:
-                    local, common, cost = local + step, common + common_step, tried
+                    local, common, cost = local + step.x, common + step.g, tried
                     damping = max(damping / 10, 1e-9)
                     break
                 damping *= 10
             else:
                 damping = 1e-4
-            settled = before - cost < 1e-5
-            if settled and looseness == 1.0:
+            if before - cost < 1e-5:
                 break
-            if settled or looseness > 1.0:
-                looseness = max(1.0, looseness / 2)
-                cost = self._cost(graph, local, common, looseness)
-            weights = self._weights(graph, local, common, looseness)
-        return local, common, cost, weights
-
-    def _weights(self, graph: Graph, local: Array, common: Array, looseness: float) -> tuple[Array, Array]:
-        """Weights of the factors: derivative of the loss by half the squared residual."""
-        field = graph.fields(local, common)[0] ** 2
-        motion = np.sum(graph.motions(local, common)[0] ** 2, axis=1)
-        if self._robust == "huber":
-            return tuple(
-                HUBER * d / np.maximum(np.sqrt(s), HUBER * d) for s, d in ((field, 1), (motion, math.sqrt(3)))
-            )  # type: ignore[return-value]
-        if self._robust == "gnc":
-            made = []
-            for s, d in ((field, 1), (motion, 3)):
-                width = looseness * GNC**2 * d
-                made.append((width / (s + width)) ** 2)
-            return made[0], made[1]
-        return np.ones(len(field)), np.ones(len(motion))
-
-    def _cost(self, graph: Graph, local: Array, common: Array, looseness: float) -> float:
-        """Sum of the losses; a reading at an unknown field costs as one of `GNC` standard deviations."""
-        residual, _, _, known = graph.fields(local, common)
-        field, motion = residual**2, np.sum(graph.motions(local, common)[0] ** 2, axis=1)
-        unknown = graph.read & ~known
-        others = np.sum(graph.walks(local)[0] ** 2) + np.sum(graph.prior(local, common) ** 2)
-        if self._robust == "huber":
-            for s, d in ((field, 1), (motion, 3)):
-                k = HUBER * math.sqrt(d)
-                others += np.sum(np.where(s < k * k, s, 2 * k * np.sqrt(s) - k * k))
-        elif self._robust == "gnc":
-            for s, d in ((field, 1), (motion, 3)):
-                width = looseness * GNC**2 * d
-                others += np.sum(width * s / (s + width))
-        else:
-            others += field.sum() + motion.sum()
-        return float(others + GNC**2 * unknown.sum())
+        return local, common, cost
 
     def _starts(self, graph: Graph, passed: list[Estimate], t: NDArray[np.float64]) -> list[Array]:
         """Trajectories to start from: the forward pass, and dead reckoning from the prior."""
@@ -479,18 +303,11 @@ class MapSmoother:
         starts = [poses]
         prior = graph.problem.prior
         if not prior.is_global and math.isfinite(prior.sd[2]):
-            reckoned = [np.array(prior.mean, float)]
+            reckoned = [prior.mean]
             for motion in graph.motion:
                 reckoned.append(moved(reckoned[-1], motion))
             starts.append(np.array(reckoned))
         return starts
-
-
-def moved(pose: Array, motion: Array) -> Array:
-    """A pose after a motion (forward, left, turn); see `magtwin.localization.odometry.increment`."""
-    c, s = math.cos(pose[2] + motion[2] / 2), math.sin(pose[2] + motion[2] / 2)
-    made: Array = pose + np.array([motion[0] * c - motion[1] * s, motion[0] * s + motion[1] * c, motion[2]])
-    return made
 
 
 def moved_back(pose: Array, motion: Array) -> Array:

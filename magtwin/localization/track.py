@@ -167,67 +167,50 @@ def checked_estimates(
     name: str, estimates: list[Any], t: Array
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     """Pose, covariance, bias and lost of all estimates."""
-    for k, estimate in enumerate(estimates):
-        if not isinstance(estimate, Estimate):
-            raise LocalizerError(
-                f"{name} returned {type(estimate).__name__} at t = {t[k]:g} s, not an Estimate"
-            )
     count = len(estimates)
-    times = np.array([_number(name, "t", e.t, when) for e, when in zip(estimates, t, strict=True)])
-    pose = np.empty((count, 3))
+    pose, covariance = np.empty((count, 3)), np.full((count, 3, 3), np.nan)
     bias, lost = np.full(count, math.nan), np.zeros(count, bool)
     for k, (e, when) in enumerate(zip(estimates, t.tolist(), strict=True)):
+        at = f"at t = {when:g} s"
+        if not isinstance(e, Estimate):
+            raise LocalizerError(f"{name} returned {type(e).__name__} {at}, not an Estimate")
+        if (time_of := _number(name, "t", e.t, when)) != when:
+            which = "from the future" if time_of > when else "of another reading"
+            raise LocalizerError(f"{name} returned an estimate {which} {at}: its t is {time_of:g} s")
         pose[k] = [_number(name, part, getattr(e, part), when) for part in ("x", "y", "yaw")]
+        if not np.isfinite(pose[k]).all():
+            raise LocalizerError(f"{name} returned a pose that is not finite {at}")
         if e.bias_nt is not None:
             bias[k] = _number(name, "bias_nt", e.bias_nt, when)
         try:
             lost[k] = bool(e.lost)
         except ValueError:
             raise LocalizerError(_not(name, "lost", "true or false", e.lost, when)) from None
-    if (wrong := times != t).any():
-        k = int(np.argmax(wrong))
-        when = "from the future" if times[k] > t[k] else "of another reading"
-        raise LocalizerError(f"{name} returned an estimate {when} at t = {t[k]:g} s: its t is {times[k]:g} s")
-    if (wrong := ~np.isfinite(pose).all(axis=1)).any():
-        raise LocalizerError(f"{name} returned a pose that is not finite at t = {t[np.argmax(wrong)]:g} s")
-    covariance = np.full((count, 3, 3), np.nan)
-    for k, e in enumerate(estimates):
-        if e.covariance is None:
-            continue
-        try:
-            matrix = np.asarray(e.covariance, float)
-        except (TypeError, ValueError):
-            text = _not(name, "covariance", "an array of numbers", e.covariance, t[k])
-            raise LocalizerError(text) from None
-        if matrix.shape != (3, 3):
-            raise LocalizerError(
-                f"{name} returned a covariance of shape {matrix.shape} at t = {t[k]:g} s, not (3, 3)"
-            )
-        covariance[k] = matrix
-    known = ~np.isnan(covariance).all(axis=(1, 2))
-    if known.any():
-        some = covariance[known]
-        scale = np.abs(some).max(axis=(1, 2), keepdims=True) + 1e-300
-        with np.errstate(invalid="ignore"):
-            apart = np.abs(some - some.transpose(0, 2, 1))
-        for bad, fault in (
-            (~np.isfinite(some).all(axis=(1, 2)), "finite"),
-            ((apart > 1e-6 * scale).any(axis=(1, 2)), "symmetric"),
-        ):
-            if bad.any():
-                k = int(np.argmax(bad))
-                i, j = np.unravel_index(np.argmax(apart[k]), (3, 3))
-                pair = f": [{i}, {j}] is {some[k, i, j]:g} and [{j}, {i}] is {some[k, j, i]:g}"
-                raise LocalizerError(
-                    f"{name} returned a covariance that is not {fault} at t = {t[known][k]:g} s"
-                    f"{pair if fault == 'symmetric' else ''}"
-                )
-        bad = np.linalg.eigvalsh(some)[:, 0] < -1e-9 * scale[:, 0, 0]
-        if bad.any():
-            when = t[known][np.argmax(bad)]
-            raise LocalizerError(
-                f"{name} returned a covariance that is not positive semidefinite at t = {when:g} s"
-            )
+        if e.covariance is not None:
+            try:
+                matrix = np.asarray(e.covariance, float)
+            except (TypeError, ValueError):
+                text = _not(name, "covariance", "an array of numbers", e.covariance, when)
+                raise LocalizerError(text) from None
+            if matrix.shape != (3, 3):
+                raise LocalizerError(f"{name} returned a covariance of shape {matrix.shape} {at}, not (3, 3)")
+            covariance[k] = matrix
+    known = np.flatnonzero(~np.isnan(covariance).all(axis=(1, 2)))
+    some, symmetric = covariance[known], covariance[known].transpose(0, 2, 1)
+    finite = np.isfinite(some).all(axis=(1, 2))
+    scale = np.abs(some).max(axis=(1, 2)) + 1e-300
+    with np.errstate(invalid="ignore"):
+        even = np.abs(some - symmetric).max(axis=(1, 2)) <= 1e-6 * scale
+    if not (finite & even).all():
+        k = int(np.argmin(finite & even))
+        fault = "symmetric" if finite[k] else "finite"
+        text = f"{name} returned a covariance that is not {fault} at t = {t[known][k]:g} s"
+        raise LocalizerError(f"{text}: {some[k].tolist()}")
+    if (bad := np.linalg.eigvalsh(some)[:, 0] < -1e-9 * scale).any():
+        when = t[known][np.argmax(bad)]
+        raise LocalizerError(
+            f"{name} returned a covariance that is not positive semidefinite at t = {when:g} s"
+        )
     return pose, covariance, bias, lost
 
 

@@ -19,7 +19,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.files.file import existing, read_text, sha256
 from magtwin.files.outputs import check_free, output, transaction
 from magtwin.io.formats import read_run
-from magtwin.io.surveys.maps import map_file, open_map
+from magtwin.io.map_files import map_file, open_map
 from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import MANIFEST, Dataset, open_dataset
 from magtwin.learn.data.dataset import build_dataset as build

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from magtwin.files.file import existing, sha256
 from magtwin.files.outputs import output
 from magtwin.frames import wrap_angle, yaw_from_quat
 from magtwin.io.formats import read_run
-from magtwin.io.surveys.maps import map_file, open_map
+from magtwin.io.map_files import map_file, open_map
 from magtwin.localization.bounds import Bounds, bounds
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.odometry import Odometry
@@ -41,7 +41,9 @@ from magtwin.report.report import Figure, Report
 from magtwin.run.run import Run, numbers_in
 from magtwin.run.thinning import field_known, newest
 from magtwin.tasks.own_field import with_own_field
-from magtwin.twin import Twin
+
+if TYPE_CHECKING:
+    from magtwin.twin import Twin
 
 RATE_HZ = 5.0
 """Default rate of readings that a localizer gets [Hz]."""
@@ -169,7 +171,7 @@ class Localization:
 
     def report(self) -> Report:
         """Errors beside their bound and dead reckoning, and a verdict in one line."""
-        return report_of(self)
+        return _report_of(self)
 
 
 def localize(
@@ -201,9 +203,8 @@ def localize(
             metadata.
         odometry: Noise model of the odometry.
         map_length_m: Correlation length of the map's error [m].
-        compensator: Model of the robot's own field for methods that use its prediction (rbpf-network): a
-            name in `magtwin.localization.compensators.COMPENSATORS`, which is fitted to `calibration`; or
-            the weights of a trained network.
+        compensator: Model of the robot's own field for methods that use its prediction (rbpf-network):
+            "none"; "iron", which is fitted to `calibration`; or the weights of a trained network.
         calibration: A drive earlier in the session with true poses, or its file.
         rate_hz: Readings per second that the method gets [Hz]. None: all.
         seed: Seed of the method and of the prior's error.
@@ -304,7 +305,7 @@ def localization(
 
 
 def live_problem(
-    twin: Twin,
+    twin: "Twin",
     anomaly_map: FieldBelief | Source | None = None,
     *,
     sensor: Mapping[str, Any] | None = None,
@@ -363,7 +364,7 @@ def new_localizer(out: Source, *, force: bool = False) -> Path:
     return out
 
 
-def report_of(result: Localization) -> Report:
+def _report_of(result: Localization) -> Report:
     """Errors of a localization beside their bound and dead reckoning, and a verdict."""
     run, scores, dead = result.run, result.scores, result.dead_reckoning
     belief = result.problem.belief
@@ -552,8 +553,7 @@ def extent_of(run: Run, belief: FieldBelief | None) -> tuple[float, float, float
 
 def check_map(run: Run, anomaly_map: AnomalyMap, file: Path) -> None:
     """Warn if a map is not the one of the run's scene, by the checksum in the run's metadata."""
-    made = str(run.metadata.get("map_sha256", ""))
-    layer = _layer_of(file)
+    made, layer = str(run.metadata.get("map_sha256", "")), _layer_of(file)
     if anomaly_map.frame and not anomaly_map.frame.startswith("world"):
         warnings.warn(
             f"the map {anomaly_map.name!r} is in the frame {anomaly_map.frame!r}; poses are taken to be in "

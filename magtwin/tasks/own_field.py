@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, find
 from magtwin.frames import into_base
-from magtwin.localization.compensators import COMPENSATORS, DISTURBANCE_COLUMNS, compensated, is_weights
+from magtwin.localization.compensators import COMPENSATORS, DISTURBANCE_COLUMNS, is_weights, with_iron
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import Problem
 from magtwin.localization.readings import onboard
@@ -26,8 +26,8 @@ def with_own_field(run: Run, compensator: str, problem: Problem) -> Run:
 
     Args:
         run: The run; models get its on-board columns.
-        compensator: "none", which changes nothing; a name in `COMPENSATORS`, which is fitted to the problem's
-            calibration drive; or the weights of a trained network (.safetensors, .pth).
+        compensator: "none", which changes nothing; "iron", fitted to the problem's calibration drive; or the
+            weights of a trained network (.safetensors, .pth).
         problem: What the method is told.
 
     Raises:
@@ -38,13 +38,13 @@ def with_own_field(run: Run, compensator: str, problem: Problem) -> Run:
         return run
     if is_weights(compensator):
         return _with_network(run, compensator, problem)
-    model = COMPENSATORS[compensator]
+    find("compensator", compensator, dict.fromkeys(COMPENSATORS))
     if problem.belief is None or problem.calibration is None:
         raise InputError(
             f"the `compensator` {compensator!r} needs a map and a `calibration` drive",
             parameter="calibration",
         )
-    return compensated(run, model().fit(problem.calibration, problem.belief))
+    return with_iron(run, problem.calibration, problem.belief)
 
 
 def _with_network(run: Run, weights: str, problem: Problem) -> Run:

@@ -3,6 +3,7 @@
 `opening` opens scenes, `simulation` makes one run, `sweeps` many, and `authoring` writes scenes from TOML.
 """
 
+from magtwin.files.kinds import scene_file, shipped_or
 from magtwin.twin.authoring import author_scene, new_scene, scene_from_toml
 from magtwin.twin.opening import (
     check_scene,
@@ -10,9 +11,7 @@ from magtwin.twin.opening import (
     led_by,
     locate,
     open_twin,
-    scene_file,
     scene_of,
-    shipped_or,
     twin_of,
 )
 from magtwin.twin.robot_scene import scene_with_robot

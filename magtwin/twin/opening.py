@@ -11,9 +11,9 @@ from contextlib import suppress
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
 
-from magtwin.errors import InputError, MismatchWarning, find
-from magtwin.files.file import git_revision, shipped
-from magtwin.files.kinds import SCENE_TOML, TOML, expected, kind_of
+from magtwin.errors import InputError, MismatchWarning
+from magtwin.files.file import git_revision
+from magtwin.files.kinds import scene_file
 from magtwin.run.run import Run
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
@@ -131,36 +131,6 @@ def _stale(stage: "OpenedScene") -> str:
         f"{stage.file}: has changed since its map {stage.map.name!r} was made: {'; '.join(stage.changes)}; "
         f"{effect}{advice}"
     )
-
-
-def scene_file(scene: str | FilePath) -> FilePath:
-    """The file of a stage, of a folder that `author_scene` wrote, or of a shipped scene's name such as "lab".
-
-    Raises:
-        InputError: The file is missing, there is no scene of that name, or it is a TOML.
-    """
-    file = FilePath(scene)
-    if file.suffix.lower() == ".toml" and kind_of(file) in (None, TOML, SCENE_TOML):
-        raise InputError(f"{scene}: describes a scene; author it first: magtwin scene {scene} --out FOLDER")
-    inside = file / f"{file.resolve().name}.usda"
-    if inside.is_file():
-        return inside
-    if file.suffix or file.exists() or len(file.parts) > 1:
-        return expected(file, "scene")
-    return find("scene", str(scene), _shipped_stages())
-
-
-def shipped_or(file: str | FilePath) -> FilePath:
-    """The stage of a shipped scene's name such as "lab", if there is no file of that name; else the path."""
-    path = FilePath(file)
-    stage = _shipped_stages().get(str(file))
-    return path if stage is None or path.exists() else stage
-
-
-def _shipped_stages() -> dict[str, FilePath]:
-    """Stages that ship with magtwin, by name."""
-    stages = shipped("scenes").glob("*/*.usda")
-    return {stage.stem: stage for stage in stages if stage.stem == stage.parent.name}
 
 
 def opened(

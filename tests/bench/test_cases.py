@@ -7,12 +7,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.bench import world
-from magtwin.bench.draws import chained, moves, noisy_odometry
+from magtwin.bench.draws import noisy_odometry
 from magtwin.bench.suite import Scenario
 from magtwin.bench.twin_case import fogm, twin_case
-from magtwin.errors import InputError
 from magtwin.files.file import shipped
-from magtwin.io.surveys.maps import open_map
+from magtwin.io.map_files import open_map
 from magtwin.localization.problem import OdometryModel, SensorModel
 
 LAB = str(shipped("scenes", "lab", "lab.usda"))
@@ -78,11 +77,6 @@ def test_a_map_with_error_has_the_sd_and_the_length_that_the_localizer_is_told(f
     assert_allclose(same[0], same[7], atol=1e-9)  # alike at all headings
 
 
-def test_a_survey_of_too_many_nodes_is_refused(field):
-    with pytest.raises(InputError, match=r"survey_spacing_m of 0\.0001 m gives .* at most 1,000,000"):
-        world.trilinear(field, 1e-4)
-
-
 def test_a_trilinear_map_states_its_error(field):
     belief = world.trilinear(field, 0.5)
     rng = np.random.default_rng(1)
@@ -100,15 +94,6 @@ def test_odometry_has_the_variances_of_its_model():
     assert_allclose(ends[:, 0].std(), np.hypot(0.05 * np.sqrt(10), 0.03 * 10), rtol=0.1)
     assert_allclose(ends[:, 1].std(), 0.05 * np.sqrt(10), rtol=0.1)
     assert_allclose(ends[:, 2], 0, atol=1e-12)
-
-
-def test_moves_and_chained_are_inverses():
-    rng = np.random.default_rng(2)
-    pose = np.cumsum(rng.normal(0, 0.1, (50, 3)), axis=0)
-    start, turn = pose[0], pose[0, 2]
-    c, s = np.cos(turn), np.sin(turn)
-    relative = np.column_stack([(pose[:, :2] - start[:2]) @ [[c, -s], [s, c]], pose[:, 2] - turn])
-    assert_allclose(chained(moves(pose)), relative, atol=1e-12)
 
 
 def test_the_drift_is_a_stationary_gauss_markov_process():

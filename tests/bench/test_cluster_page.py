@@ -2,7 +2,6 @@
 
 import os
 import re
-import shlex
 import subprocess
 
 import pytest
@@ -24,14 +23,6 @@ def blocks(language):
 def parsed(words):
     """What a command of magtwin gets, without running it."""
     return app.parse_args(words, exit_on_error=False, print_error=False)[1].arguments
-
-
-def test_every_command_of_magtwin_on_the_page_has_the_options_that_it_is_given():
-    lines = [line for block in blocks("console") for line in block.splitlines() if "magtwin " in line]
-    assert len(lines) >= 6
-    for line in lines:
-        words = shlex.split(line.partition("magtwin ")[2].partition(":::")[0].replace("{}/4", "0/4"))
-        assert parsed(words), line
 
 
 def test_the_batch_script_shares_the_work_between_its_tasks(tmp_path):

@@ -1,16 +1,14 @@
 """Leaderboard and report: intervals, verdicts, paired differences, and a page that says so."""
 
-import json
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from magtwin.bench.leaderboard import compare_rows, standings
-from magtwin.bench.report import describe, page_of_comparison, page_of_results
-from magtwin.bench.suite import Scenario, load_suite
+from magtwin.bench.report import describe, page_of_results
+from magtwin.bench.suite import load_suite
 from magtwin.errors import InputError
-from magtwin.figures.page import to_html, to_json, to_markdown
+from magtwin.figures.page import to_html, to_markdown
 
 RUNS = 40
 
@@ -127,59 +125,19 @@ def test_only_runs_that_both_finished_are_compared_and_none_is_an_error():
         compare_rows(rows_of("f", 0.1), rows_of("g", 0.1))
 
 
-def tracks_of(rows):
-    t = np.arange(60, dtype=np.float32) / 2
-    return [
-        {
-            "scenario": s,
-            "localizer": name,
-            "run": k,
-            "t": t,
-            "error_m": 0.1 + 0 * t,
-            "bound_m": 0.05 + 0 * t,
-            "x": 2 * np.sin(t / 5),
-            "y": np.cos(t / 5),
-            "lost": 0 * t,
-        }
-        for s, name, k in zip(rows["scenario"], rows["localizer"], rows["run"], strict=True)
-    ]
-
-
-def test_the_page_has_every_scenario_with_its_tables_and_pictures_and_escapes_names():
-    rows = joined(
-        rows_of("<b>f</b>", 0.1, failed=2),
-        rows_of("odometry", 0.5),
-        rows_of("odometry", 0.5, scenario="global"),
-    )
-    scenarios = {name: Scenario(name=name) for name in ("tracking", "global")}
-    times = {name: rows[name] for name in ("scenario", "localizer", "run")} | {
-        "step_us": np.full(3 * RUNS, 50.0)
-    }
-    page = page_of_results(rows, times, tracks_of(rows), scenarios, title="Benchmark small")
-    html = to_html(page)
-    assert "<b>f</b>" not in html
-    assert [section.title for section in page.sections] == ["Leaderboard", "tracking", "global"]
-    assert [len(section.pictures) for section in page.sections] == [1, 3, 3]
+def test_the_page_names_failures_and_escapes_names():
+    rows = joined(rows_of("<b>f</b>", 0.1, failed=2), rows_of("odometry", 0.5))
+    page = page_of_results(rows, None, [], {}, title="Benchmark small")
+    assert "<b>f</b>" not in to_html(page)
     titles = [table.title for table in page.sections[1].tables]
     assert titles == ["Accuracy", "Reliability", "Paired differences", "Failures"]
     assert "step raised ZeroDivisionError" in to_markdown(page)
-    found = json.loads(to_json(page))["standings"]
-    assert len(found) == 3
-    assert found[0]["rmse_m"]["low"] < found[0]["rmse_m"]["value"]
-    assert found[0]["step_us"] == 50.0
 
 
-def test_a_page_of_two_results_names_them_and_says_which_is_better():
-    page = page_of_comparison(rows_of("f", 0.1), rows_of("f", 0.2), ("new", "old"))
-    text = to_markdown(page)
-    assert "new" in page.lead
-    assert "old" in page.lead
-    assert "f is better than f" not in text
-
-
-@pytest.mark.parametrize("name", ["standard", "aprilab", "magnetic-data", "ship", "1d"])
-def test_every_scenario_that_ships_is_described_in_words(name):
-    for scenario in load_suite(name).scenario:
-        text = describe(scenario)
-        assert text.endswith(".")
-        assert f"{scenario.runs} run{'s' * (scenario.runs > 1)} " in text
+def test_a_scenario_is_described_by_what_its_suite_sets():
+    known = load_suite("standard").scenarios
+    assert describe(known["exact"]) == "300 runs of 90 s in 50 sessions."
+    assert "map_error_nt 150.0, sensor.iron_nt 400.0, kidnaps 2" in describe(known["kidnapped"])
+    assert describe(load_suite("ship").scenarios["loop-2"]).startswith(
+        "100 runs of recorded data. Set: source ship"
+    )

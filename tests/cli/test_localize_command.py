@@ -1,7 +1,6 @@
 """`magtwin localize` and `magtwin new localizer.py`: what a user types, and what is printed and written."""
 
 import dataclasses
-import json
 import sys
 from pathlib import Path
 
@@ -14,10 +13,9 @@ from magtwin.errors import InputError, MismatchWarning
 from magtwin.files.file import shipped
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
-from magtwin.localization.problem import Prior
 from magtwin.localization.readings import onboard
 from magtwin.localization.scores import Scores, verdict_of
-from magtwin.tasks.localizing import Localization, localization, prior_of, thinned
+from magtwin.tasks.localizing import localization, prior_of, thinned
 
 
 @pytest.fixture(scope="module")
@@ -64,20 +62,6 @@ def test_a_new_localizer_runs_as_it_stands_and_beats_dead_reckoning(
         np.testing.assert_array_equal(run[name], result.run[name])
     truth = np.loadtxt(here / "out" / "truth.tum")
     np.testing.assert_allclose(truth[:, 1:3], run["p_world_base"][:, :2], atol=1e-8)
-
-
-def test_the_errors_are_those_of_the_columns_beside_their_bound(
-    here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    main(["localize", "run.parquet", "--map", "lab", "--method", "odometry", "--out", "dead", "--json"])
-    printed = json.loads(capsys.readouterr().out)
-    run = mt.load_run(here / "dead" / "run.parquet")
-    off = np.hypot(*(run["est_p_world_base"] - run["p_world_base"])[:, :2].T)
-    figures = {name: figure["value"] for name, figure in printed["figures"].items()}
-    assert figures["position error, RMSE"] == pytest.approx(np.sqrt(np.mean(off**2)))
-    assert figures["dead reckoning, RMSE"] == pytest.approx(figures["position error, RMSE"])
-    assert 0.01 < figures["bound"] < figures["position error, RMSE"]
-    assert printed["verdict"].startswith("No better than dead reckoning: ")
 
 
 def test_without_a_map_it_is_slam_and_has_no_bound(here: Path) -> None:
@@ -270,15 +254,6 @@ def test_a_prior_is_drawn_about_the_truth_with_the_spread_that_it_states(here: P
 )
 def test_a_verdict_says_whether_it_is_better_consistent_and_lost(scores: Scores, said: str) -> None:
     assert verdict_of(scores, 0.2) == said
-
-
-def test_dead_reckoning_of_a_global_start_begins_at_the_true_pose(here: Path) -> None:
-    result = localization("run.parquet", "lab", method="odometry", prior=Prior(sd=(np.inf,) * 3))
-    assert isinstance(result, Localization)
-    assert result.dead_reckoning is not None
-    assert result.truth is not None
-    np.testing.assert_allclose(result.dead_reckoning.pose[0], result.truth[0], atol=1e-12)
-    assert "dead reckoning from the true start" in result.report().verdict
 
 
 @pytest.mark.parametrize("name", ["random.py", "my-filter.py", "class.py"])

@@ -7,8 +7,8 @@ from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.figures.views import film, report_runs
 from magtwin.io.convert import convert_run
+from magtwin.io.map_files import map_file, open_map
 from magtwin.io.provenance import repeat_of
-from magtwin.io.surveys.maps import map_file, open_map
 from magtwin.tasks.learning import build_dataset, map_of_scene
 from magtwin.twin import open_twin, scene_of, simulate
 

@@ -16,7 +16,8 @@ from magtwin.author.earth import earth_of
 from magtwin.cli import main
 from magtwin.field.sources.earth import earth_field_nt
 from magtwin.field.survey.folder import node_map
-from magtwin.io.surveys.maps import _contradictions, _masked, open_map
+from magtwin.io.map_files import open_map
+from magtwin.io.surveys.maps import _contradictions, _masked
 from magtwin.io.surveys.readings import load_readings, save_readings
 from magtwin.usd.maps.layer import load_map
 from magtwin.usd.scene import read_scene

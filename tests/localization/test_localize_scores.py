@@ -7,14 +7,12 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.stats import chi2
 
-from magtwin.errors import InputError
 from magtwin.localization.bounds import Bounds
 from magtwin.localization.scores import (
     BOUNDS,
     Scores,
     anees_interval,
     independent,
-    nees,
     score,
 )
 from magtwin.localization.track import Track
@@ -68,15 +66,6 @@ def test_a_right_covariance_has_anees_1_and_covers_90_percent():
     assert made.anees_low < made.anees < made.anees_high
     half = score(track(error, sd=0.025), truth(20000))
     assert half.anees_position == pytest.approx(4 * made.anees_position)
-
-
-def test_nees_is_that_of_the_inverse_and_infinite_without_variance():
-    rng = np.random.default_rng(2)
-    root = rng.normal(size=(50, 3, 3))
-    P, e = root @ root.transpose(0, 2, 1), rng.normal(size=(50, 3))
-    assert_allclose(nees(e, P), [a @ np.linalg.inv(B) @ a for a, B in zip(e, P, strict=True)], rtol=1e-6)
-    flat = np.diag([1.0, 0.0, 1.0])
-    assert_allclose(nees([[1, 0, 1], [0, 1, 0]], [flat, flat]), [2, math.inf])
 
 
 def test_the_chi_square_interval_is_scipys_for_independent_errors_and_wider_for_others():
@@ -137,18 +126,6 @@ def test_recovery_is_timed_from_each_kidnapping():
     assert once.row()["recovery_s"] == pytest.approx(6.0)
 
 
-def test_only_flags_on_good_poses_are_false():
-    n = 300
-    lost = np.zeros(n, bool)
-    lost[[0, 50, 51, 120, 200]] = True
-    error = far(n, slice(120, 130))
-    made = score(track(error, lost=lost), truth(n))
-    assert made.false_lost == 3
-    assert made.lost_share == pytest.approx(5 / n)
-    start = score(track(far(n, slice(0, 60)), lost=lost), truth(n), global_start=True)
-    assert start.false_lost == 2  # those before convergence are right to be lost
-
-
 def test_the_ratio_to_a_bound_is_over_the_rows_that_count():
     n = 300
     falling = np.linspace(1, 0.01, n)
@@ -170,17 +147,3 @@ def test_a_failed_run_has_a_reason_and_nan():
     assert set(row) == set(fine.row())
     assert fine.failed == ""
     assert fine.rmse_m == pytest.approx(math.sqrt(1 / 60))
-
-
-def test_without_covariance_there_is_no_consistency():
-    plain = track(far(100, 3))
-    unknown = Track(plain.t, plain.pose, np.full((100, 3, 3), np.nan), plain.bias_nt, plain.lost)
-    made = score(unknown, truth(100))
-    assert math.isnan(made.anees)
-    assert math.isnan(made.coverage)
-    assert made.rmse_m == pytest.approx(0.1)
-
-
-def test_a_truth_of_another_length_is_refused():
-    with pytest.raises(InputError, match=r"\(100, 3\)"):
-        score(track(far(100, 3)), truth(99))

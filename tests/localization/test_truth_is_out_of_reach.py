@@ -13,9 +13,9 @@ from magtwin.errors import RepairWarning
 from magtwin.frames import quat_from_yaw
 from magtwin.localization.odometry import Odometry
 from magtwin.localization.problem import Estimate, Problem
-from magtwin.localization.readings import NEEDED, ONBOARD, onboard, readings_of
+from magtwin.localization.readings import onboard, readings_of
 from magtwin.localization.track import LocalizerError, track
-from magtwin.run.run import COLUMNS, Run
+from magtwin.run.run import Run
 
 TRUE = (
     "p_world_base",
@@ -82,13 +82,6 @@ def test_no_true_column_can_be_reached_from_a_problem_and_a_reading(run):
         assert not holds(arrays, run[name]), name
 
 
-def test_on_board_columns_are_none_of_the_true_ones(run):
-    assert not set(ONBOARD) & set(TRUE)
-    assert set(NEEDED) <= set(ONBOARD)
-    assert {name for name in ONBOARD if name in COLUMNS} <= set(run)
-    assert not set(onboard(run).metadata)
-
-
 def test_a_reading_holds_no_later_reading(run):
     readings = readings_of(run)
     next(readings)
@@ -133,7 +126,7 @@ class Wrong:
         (lambda r: Estimate(r.t, 0, 0, 0, -np.eye(3)), "not positive semidefinite"),
         (
             lambda r: Estimate(r.t, 0, 0, 0, np.arange(9.0).reshape(3, 3)),
-            r"not symmetric .*: \[0, 2\] is 2 and \[2, 0\]",
+            "not symmetric at t = 0 s",
         ),
         (lambda r: Estimate(r.t, 0, 0, 0, np.diag([1, 1, np.inf])), "a covariance that is not finite"),
         (lambda r: sys.exit(3), "raised SystemExit at t = 0 s: 3"),
@@ -163,11 +156,6 @@ def test_headings_of_many_turns_are_not_taken_for_degrees(turning, heading, recw
     assert not recwarn
     assert np.abs(made_odometry.pose[:, 2]).max() > 40
     np.testing.assert_allclose(np.cos(made.pose[:, 2] - made_odometry.pose[:, 2]), 1, atol=0.05)
-
-
-def test_a_command_that_sigterm_ends_is_no_fault_of_the_localizer(run):
-    with pytest.raises(SystemExit):
-        track(Wrong(lambda r: sys.exit(143)), Problem(belief=None, extent=(-3, 3, -2, 2)), run)
 
 
 def test_a_refusal_of_a_localizer_says_what_is_wrong_and_not_where_it_was_raised(run):

@@ -17,8 +17,7 @@ from magtwin.field.survey.folder import read_survey as read_folder
 from magtwin.field.survey.hold import without_repeats
 from magtwin.field.survey.readings import Readings, masked_words, taken_of
 from magtwin.field.survey.stuck import mask_stuck
-from magtwin.files.file import existing, sha256
-from magtwin.files.kinds import expected
+from magtwin.files.file import sha256
 from magtwin.files.outputs import check_free, output, transaction
 from magtwin.io.surveys.about import About
 from magtwin.io.surveys.columns import Columns
@@ -31,7 +30,6 @@ from magtwin.io.surveys.readings import (
     save_readings,
 )
 from magtwin.report.report import Report
-from magtwin.twin import scene_file
 
 Method = Literal["auto", "trilinear", "cubic", "gp", "harmonic"]
 Split = Literal["checkerboard", "heading", "run", "block"]
@@ -49,41 +47,6 @@ USUAL_READINGS = 100
 
 MOST_MASKED = 0.9
 """Share of masked nodes above which the report doubts the map."""
-
-
-def open_map(file: Source) -> AnomalyMap:
-    """The map of a layer or stage, or of a folder of survey CSVs.
-
-    Args:
-        file: As for `map_file`.
-
-    Raises:
-        InputError: There is no map, or it is damaged.
-    """
-    from magtwin.usd.maps.layer import load_map
-
-    file = map_file(file)
-    if not file.is_dir():
-        return load_map(file)
-    return read_folder(expected(file, "map"))[0]
-
-
-def map_file(source: Source) -> Path:
-    """The file of a map: a layer, a stage, a folder of CSVs or of a scene, or the stage of a shipped scene.
-
-    Raises:
-        InputError: There is no such file or scene.
-    """
-    path = Path(source)
-    if path.is_file() or (path.is_dir() and not (path / f"{path.resolve().name}.usda").is_file()):
-        return path
-    if path.suffix or (len(path.parts) > 1 and not path.exists()):
-        return existing(path, "map")
-    try:
-        return scene_file(path)
-    except InputError as error:
-        text = f"{source}: no map layer, stage, folder of CSVs or shipped scene: {error}"
-        raise InputError(text) from error
 
 
 def read_survey(

@@ -5,29 +5,19 @@ import math
 import numpy as np
 
 from magtwin.compiled import Loops
+from magtwin.localization.belief import Table, known_values
+from magtwin.localization.grid.state import Known, Motion, Sums
 from magtwin.localization.odometry import increment
 from magtwin.localization.problem import Array, Problem, Reading
 
 LOOPS = Loops("magtwin.localization.grid.bank_loops", pays=0.0)
 """Compiled loops; a bank in plain Python would take minutes."""
 
-STATS = 14
-"""Number of sums that compiled updates return; see `grid_loops.update`."""
-
-CUT = 20.0
-"""Filters and nodes whose mass is below exp(-CUT) of the greatest are dropped."""
-
 SPAN = 3.6
 """Half width of a Gaussian that is kept [standard deviations]."""
 
 OVERLAP = 0.45
 """Standard deviation of a component by the distance to the next one."""
-
-OUTSIDE = 1.0
-"""Penalty of a pose outside the extent per reading [nats]."""
-
-WHITE_SHARE = 0.16
-"""Share of the map's variance that differs from reading to reading; the rest is correlated along the path."""
 
 
 class Likelihood:
@@ -41,55 +31,49 @@ class Likelihood:
     """
 
     def __init__(self, problem: Problem, table: Array, spreads: Array, temper: float) -> None:
-        from magtwin.field.maps.trilinear import planes
-
         self.problem, self.table, self.spreads, self.temper = problem, table, spreads, temper
         self.mapped, self.iron = len(spreads) > 0, problem.sensor.iron_nt > 0
-        begin, end, *_ = planes(table)
-        values = table[begin:end]
-        if len(table) > end:
-            values = values[table[end:] == 0]
+        values = known_values(Table(table, spreads))
         self.wide = (float(values.mean()), float(values.var()) + 1.0)
         sensor = problem.sensor
         sd = [sensor.offset_nt, sensor.drift_nt]
         self.start = np.array(sd + [1.0] * self.mapped + [sensor.iron_nt] * (2 * self.iron)) ** 2
         """Prior variances of the linear states: offset, drift, map error, iron cos and sin."""
 
-    def numbers(self, reading: Reading, reference: Array) -> list[float]:
-        """The first entries of `numbers` of the compiled updates."""
+    def known(self, reading: Reading, reference: Array) -> Known:
+        """What a reading tells the compiled updates."""
         sensor = self.problem.sensor
-        return [
+        values = (
             reading.b_nt - reading.disturbance_nt,
             *sensor.lever_arm_m,
             sensor.white_nt**2 + reading.disturbance_sd_nt**2,
-            WHITE_SHARE,
             1 / self.temper,
             self.mapped,
             self.iron,
             *self.wide,
             *self.problem.extent,
-            OUTSIDE,
-            CUT,
             *reference.tolist(),
-        ]
+        )
+        return Known(*map(float, values))
 
-    def dynamics(self, dt: float, distance: float) -> tuple[list[float], list[float]]:
+    def dynamics(self, dt: float, distance: float) -> tuple[Array, Array]:
         """Decay and noise variance of the linear states over a step."""
         sensor = self.problem.sensor
         time = math.exp(-dt / sensor.drift_s)
         along = math.exp(-distance / self.problem.map_length_m)
         decay = [1.0, time] + [along] * self.mapped + [1.0, 1.0] * self.iron
-        noise = [0.0, (1 - time**2) * sensor.drift_nt**2]
-        return decay, noise + [1 - along**2] * self.mapped + [0.0, 0.0] * self.iron
+        noise = [0.0, (1 - time**2) * sensor.drift_nt**2] + [1 - along**2] * self.mapped
+        return np.array(decay), np.array(noise + [0.0, 0.0] * self.iron)
 
 
-def moments(stats: Array) -> tuple[Array, Array]:
+def moments(sums: Sums) -> tuple[Array, Array]:
     """Mean, minus the reference, and covariance of x, y and yaw from the sums of a compiled update."""
-    shift = stats[4:7] / stats[3]
+    shift = np.array([sums.x, sums.y, sums.yaw]) / sums.mass
+    upper = np.array([sums.xx, sums.xy, sums.x_yaw, sums.yy, sums.y_yaw, sums.yaw_yaw])
     second = np.empty((3, 3))
-    second[np.triu_indices(3)] = stats[7:13]
-    second.T[np.triu_indices(3)] = stats[7:13]
-    return shift, second / stats[3] - np.outer(shift, shift)
+    second[np.triu_indices(3)] = upper
+    second.T[np.triu_indices(3)] = upper
+    return shift, second / sums.mass - np.outer(shift, shift)
 
 
 class Bank:
@@ -155,39 +139,34 @@ class Bank:
         """Their covariances, shape (K, n, n)."""
         return self._state.reshape(len(self.logw), -1)[:, self.n :].reshape(-1, self.n, self.n)
 
-    def step(self, last: Reading | None, reading: Reading, reference: Array) -> Array:
+    def step(self, last: Reading | None, reading: Reading, reference: Array) -> Sums:
         """Move by the odometry, use a reading, and drop components without mass.
 
         Args:
             last: The reading before, or None.
             reading: The reading.
             reference: x, y and yaw from which the sums are taken.
-
-        Returns:
-            The sums `stats` of the compiled update.
         """
-        problem = self.likelihood.problem
         dt, motion = 0.0, (0.0, 0.0, 0.0)
         if last is not None:
             dt, motion = reading.t - last.t, increment(last.odometry, reading.odometry)
         distance = math.hypot(motion[0], motion[1])
-        decay, noise = self.likelihood.dynamics(dt, distance)
-        pose = [1.0] * 4, [0.0] * 4
-        numbers = [*self.likelihood.numbers(reading, reference), *motion]
-        numbers += [*problem.odometry.variances(distance, motion[2], dt), *pose[0], *decay, *pose[1], *noise]
-        stats = np.empty(STATS)
-        table, spreads = self.likelihood.table, self.likelihood.spreads
-        self._code.update_bank(table, spreads, self.logw, self._state, np.array(numbers, float), stats)
-        if stats[1] < 0.8 * len(self.logw):
+        place, _, yaw = self.likelihood.problem.odometry.variances(distance, motion[2], dt).tolist()
+        forward, left, turn = map(float, motion)
+        known, moved = self.likelihood.known(reading, reference), Motion(forward, left, turn, place, yaw)
+        tables = self.likelihood.table, self.likelihood.spreads
+        dynamics = self.likelihood.dynamics(dt, distance)
+        sums: Sums = self._code.update_bank(*tables, self.logw, self._state, known, moved, *dynamics)
+        if sums.kept < 0.8 * len(self.logw):
             kept = np.isfinite(self.logw)
             self._state = np.ascontiguousarray(self._state.reshape(len(kept), -1)[kept]).ravel()
             self.logw = np.ascontiguousarray(self.logw[kept])
-            stats[2] = np.argmax(self.logw)
-        return stats
+            sums = sums._replace(best=int(np.argmax(self.logw)))
+        return sums
 
-    def heaviest(self, stats: Array) -> Array:
+    def heaviest(self, sums: Sums) -> Array:
         """x, y and yaw of the component with the most mass."""
-        made: Array = self.means[int(stats[2]), :3].copy()
+        made: Array = self.means[sums.best, :3].copy()
         return made
 
     def smooth(self, covariance: Array) -> bool:
@@ -197,8 +176,8 @@ class Bank:
         root = np.linalg.cholesky(np.linalg.inv(covariance + 1e-14 * np.eye(3)))
         return bool(np.linalg.eigvalsh(root.T @ within @ root)[0] > 0.3)
 
-    def splat(self, poses: Array, logw: Array, state: Array) -> None:
-        """Evaluate the mixture at nodes, shape (3 N,): their mass and linear states given the pose."""
+    def splat(self, poses: Array) -> tuple[Array, Array]:
+        """Log mass of the mixture at nodes, shape (N, 3), and their linear states given the pose, (N, s)."""
         some = np.argsort(-self.logw)[:60]
         some = some[self.logw[some] > self.logw[some[0]] - 8]
         means, covariances = self.means[some], self.covariances[some]
@@ -206,9 +185,18 @@ class Bank:
         inverses = np.linalg.inv(pose)
         slopes = covariances[:, 4:, :3] @ inverses
         rest = covariances[:, 4:, 4:] - slopes @ covariances[:, :3, 4:]
-        n = self.n - 4
-        a, b = np.triu_indices(n)
-        linear = np.concatenate([means[:, 4:], slopes.reshape(len(some), -1), rest[:, a, b]], axis=1)
-        weights = self.logw[some] - 0.5 * np.linalg.slogdet(pose)[1]
-        flat = (np.ascontiguousarray(v).ravel() for v in (means[:, :3], inverses, linear))
-        self._code.splat(np.ascontiguousarray(weights), *flat, poses, logw, state)
+        away = poses[:, None] - means[:, :3]
+        away[..., 2] -= 2 * math.pi * np.floor(away[..., 2] / (2 * math.pi) + 0.5)
+        logs = self.logw[some] - 0.5 * np.linalg.slogdet(pose)[1]
+        logs = logs - 0.5 * np.einsum("kgi,gij,kgj->kg", away, inverses, away)
+        most = logs.max(axis=1, keepdims=True)
+        shares = np.exp(logs - most)
+        mass = shares.sum(axis=1, keepdims=True)
+        shares /= mass
+        each = means[:, 4:] + np.einsum("gni,kgi->kgn", slopes, away)
+        mean = np.einsum("kg,kgn->kn", shares, each)
+        each -= mean[:, None]
+        a, b = np.triu_indices(self.n - 4)
+        spread = np.einsum("kg,gm->km", shares, rest[:, a, b])
+        spread += np.einsum("kg,kgn,kgn->kn", shares, each[..., a], each[..., b])
+        return (most + np.log(mass))[:, 0], np.concatenate([mean, spread], axis=1)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.localization.slam.arrow import Arrow, Solution, gram
+from magtwin.localization.arrow import Arrow, Solution, gram
 from magtwin.localization.slam.model import Model, State, cross
 from magtwin.localization.slam.samples import Samples
 
@@ -167,17 +167,8 @@ class Batch:
             out[:, 3:6, 3:6] += -v / 2 + v @ v / 12
         return out
 
-    def iterate(self, state: State, most: int) -> tuple[State, float]:
-        """Gauss-Newton iterations, at most `most`.
-
-        Returns:
-            The state and its cost.
-        """
-        state, cost, _ = self.solved(state, most)
-        return state, cost
-
     def solved(self, state: State, most: int) -> tuple[State, float, Solution]:
-        """As `iterate`, with the linear system of the last iteration."""
+        """Gauss-Newton, at most `most` iterations: the state, its cost and the system of the last one."""
         for _ in range(most):
             arrow, r = self.linearised(state)
             step = arrow.solve()
@@ -219,24 +210,8 @@ class Batch:
         state, cost = self.fit_constants(state), math.inf
         for factor, most in levels:
             self.set_noise(factor)
-            state, cost = self.iterate(state, most)
+            state, cost, _ = self.solved(state, most)
         return state, cost
-
-    def posterior(self, state: State) -> tuple[Solution, float]:
-        """Linearisation at a state: covariances, and the Laplace approximation of -log p(y).
-
-        -log p(y) is near cost + log det(H) / 2 + sum of the logarithms of all standard deviations, where H is
-        the matrix of the normal equations (MacKay 2003, Information Theory, Inference, and Learning
-        Algorithms, eq. 27.6; constant terms are left out).
-        """
-        arrow, r = self.linearised(state)
-        solution = arrow.solve()
-        roots = [self._root_start, self._root_steps, self._root_constants]
-        known = self._root_readings[self._known]
-        spread = -sum(float(np.log(root).sum()) for root in roots) - self.model.width * float(
-            np.log(known).sum()
-        )
-        return solution, r.cost + 0.5 * solution.log_determinant() + spread
 
 
 def _rows(state: State, rows: slice) -> State:

@@ -14,7 +14,6 @@ processes, eq. 20).
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,60 +22,9 @@ from magtwin.compiled import Loops
 from magtwin.errors import InputError
 
 Array = NDArray[np.float64]
-Kernel = Literal["se", "matern32", "matern52"]
 
 LOOPS = Loops("magtwin.localization.slam.hilbert_loops", pays=0)
 """Compiled loops: a solution takes a quarter of the time of that with numpy."""
-
-SMOOTHNESS = {"se": math.inf, "matern32": 1.5, "matern52": 2.5}
-"""Smoothness nu of each kernel; the squared exponential is the limit of the Matern kernels."""
-
-
-def spectral_density(kernel: Kernel, frequency: ArrayLike, *, sd: float, length_m: float, axes: int) -> Array:
-    """Spectral density of an isotropic kernel (Rasmussen and Williams 2006, eqs. 4.11 and 4.15).
-
-        se:      sd^2 (2 pi)^(d/2) l^d exp(-l^2 w^2 / 2)
-        matern:  sd^2 2^d pi^(d/2) G(nu + d/2) (2 nu)^nu / (G(nu) l^(2 nu)) (2 nu / l^2 + w^2)^-(nu + d/2)
-
-    Args:
-        kernel: A key of `SMOOTHNESS`.
-        frequency: Angular frequencies w [rad/m].
-        sd: Standard deviation of the process.
-        length_m: Length scale l [m].
-        axes: Dimensions d of space.
-
-    Returns:
-        The density, in the unit of sd^2 m^d, with the shape of `frequency`.
-
-    Raises:
-        InputError: There is no such kernel.
-    """
-    w, d = np.asarray(frequency, float), axes
-    nu = smoothness(kernel)
-    if math.isinf(nu):
-        return np.asarray(
-            sd**2 * (math.sqrt(2 * math.pi) * length_m) ** d * np.exp(-((length_m * w) ** 2) / 2)
-        )
-    scale = 2**d * math.pi ** (d / 2) * math.gamma(nu + d / 2) * (2 * nu) ** nu
-    scale /= math.gamma(nu) * length_m ** (2 * nu)
-    return np.asarray(sd**2 * scale * (2 * nu / length_m**2 + w**2) ** -(nu + d / 2))
-
-
-def smoothness(kernel: Kernel) -> float:
-    """Smoothness nu of a kernel.
-
-    Raises:
-        InputError: There is no such kernel.
-    """
-    if kernel not in SMOOTHNESS:
-        raise InputError(f"kernel must be one of {', '.join(SMOOTHNESS)}, got {kernel!r}", parameter="kernel")
-    return SMOOTHNESS[kernel]
-
-
-def slope_sd(kernel: Kernel, sd: float, length_m: float) -> float:
-    """Standard deviation of each partial derivative: sqrt(-k''(0)); sd / l for the squared exponential."""
-    nu = smoothness(kernel)
-    return sd / length_m * (1.0 if math.isinf(nu) else math.sqrt(nu / (nu - 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,21 +73,6 @@ class Basis:
         parts = [np.prod([cosines[..., a] if a == b else sines[..., b] for b in axes], axis=0) for a in axes]
         return np.stack(parts, axis=-2)
 
-    def hessians(self, p: ArrayLike, weights: ArrayLike) -> Array:
-        """Second derivatives of sum_j weights_j phi_j, shape (..., d, d)."""
-        sines, cosines = self._waves(p)
-        axes = range(len(self.low))
-        w = np.asarray(weights, float)
-        out = np.empty((*sines.shape[:-2], len(self.low), len(self.low)))
-        whole = sines.prod(axis=-1)
-        frequency = self.frequency
-        for a in axes:
-            out[..., a, a] = -whole @ (frequency[:, a] ** 2 * w)
-            for b in range(a):
-                mixed = np.prod([cosines[..., c] if c in (a, b) else sines[..., c] for c in axes], axis=0)
-                out[..., a, b] = out[..., b, a] = mixed @ w
-        return out
-
     def slopes(self, p: Array, weights: Array) -> Array:
         """Gradient of sum_j weights_j phi_j in space, compiled; shape (N, 3)."""
         slope = np.empty(p.shape)
@@ -148,16 +81,26 @@ class Basis:
         return slope
 
     def derivatives(self, p: Array, weights: Array) -> tuple[Array, Array, Array]:
-        """`gradients`, `slopes` and `hessians` in space, compiled; shapes (N, 3, M), (N, 3) and (N, 3, 3)."""
+        """`gradients`, `slopes` and second derivatives, compiled; shapes (N, 3, M), (N, 3) and (N, 3, 3)."""
         gradients, hessian = np.empty((len(p), 3, self.count)), np.empty((len(p), 3, 3))
         slope = np.empty(p.shape)
         LOOPS.open().potential(p, self.low, self.sides, self.order, weights, gradients, slope, hessian)
         return gradients, slope, hessian
 
-    def variances(self, kernel: Kernel, *, sd: float, length_m: float) -> Array:
-        """Prior variances of the weights for a kernel, shape (M,)."""
-        frequency = np.sqrt(self.eigenvalues)
-        return spectral_density(kernel, frequency, sd=sd, length_m=length_m, axes=len(self.low))
+    def variances(self, *, sd: float, length_m: float) -> Array:
+        """Prior variances of the weights, by the squared exponential kernel (Rasmussen and Williams 2006).
+
+            S(w) = sd^2 (2 pi)^(d/2) l^d exp(-l^2 w^2 / 2),  w = sqrt(lambda)
+
+        Args:
+            sd: Standard deviation of the process.
+            length_m: Length scale l [m].
+
+        Returns:
+            Variances [sd^2 m^d], shape (M,).
+        """
+        volume = (math.sqrt(2 * math.pi) * length_m) ** len(self.low)
+        return np.asarray(sd**2 * volume * np.exp(-((length_m * np.sqrt(self.eigenvalues)) ** 2) / 2))
 
     def _waves(self, p: ArrayLike) -> tuple[Array, Array]:
         """sqrt(2 / L) sin(w x) and its derivative, shapes (..., M, d)."""

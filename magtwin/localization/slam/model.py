@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from magtwin.errors import InputError
 from magtwin.localization.problem import Estimate, Problem
-from magtwin.localization.slam.hilbert import Basis, basis, slope_sd
+from magtwin.localization.slam.hilbert import Basis, basis
 from magtwin.localization.slam.samples import Samples, about_z
 from magtwin.localization.slam.settings import Settings
 
@@ -37,6 +37,9 @@ Array = NDArray[np.float64]
 
 LEAST_STD_M, LEAST_STD_RAD, LEAST_STD_NT = 1e-4, 1e-5, 1e-2
 """Least standard deviations of a step, so that weights stay finite."""
+
+MARGIN_M = 1.0
+"""Space between the floor's extent and the border of the eigenfunctions' box [m]."""
 
 MOST_TILT = math.radians(1)
 """Most standard deviation of roll and pitch at the start [rad]."""
@@ -132,15 +135,15 @@ class Model:
         self.start = State(p0[None], R0[None], np.zeros((1, self.drifts)), zero)
 
     def _field(self, height: float) -> tuple[Basis, Array]:
-        settings, margin = self.settings, self.settings.margin_m
+        settings, margin = self.settings, MARGIN_M
         x0, x1, y0, y1 = self.problem.extent
         low, high = [x0 - margin, y0 - margin], [x1 + margin, y1 + margin]
         sd = settings.sd_nt
         if self.vector:
             low, high = [*low, height - margin], [*high, height + margin]
-            sd /= slope_sd(settings.kernel, 1.0, settings.length_m)
+            sd *= settings.length_m  # the potential's, whose slope has the sd of the field
         functions = basis(low, high, int(settings.functions))
-        return functions, functions.variances(settings.kernel, sd=sd, length_m=settings.length_m)
+        return functions, functions.variances(sd=sd, length_m=settings.length_m)
 
     def _constants(self, variances: Array) -> tuple[Layout, Array]:
         s, sensor, odometry = self.settings, self.problem.sensor, self.problem.odometry

@@ -2,13 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from magtwin.errors import InputError
 from magtwin.localization.problem import Reading
 
 Array = NDArray[np.float64]
@@ -51,17 +49,6 @@ def has_vector(reading: Reading) -> bool:
     """Whether a reading has all three axes of the field."""
     b = reading.signals.get("b_vector_measured_nt")
     return b is not None and bool(np.isfinite(b).all())
-
-
-def is_vector(field: Literal["auto", "vector", "scalar"], reading: Reading) -> bool:
-    """Whether to use three axes, by the option `field` and the first reading.
-
-    Raises:
-        InputError: Three axes are asked for and there are none.
-    """
-    if field == "vector" and "b_vector_measured_nt" not in reading.signals:
-        raise InputError("the run has no column 'b_vector_measured_nt', which field = vector needs")
-    return field == "vector" or (field == "auto" and has_vector(reading))
 
 
 def samples_of(readings: Sequence[Reading], vector: bool) -> Samples:

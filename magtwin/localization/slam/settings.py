@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 from magtwin.errors import InputError
-from magtwin.localization.slam.hilbert import Kernel, smoothness
 
 
 @dataclass(kw_only=True)
@@ -23,15 +22,6 @@ class Settings:
 
     uniform_sd_nt: float = 50_000.0
     """Prior standard deviation of the uniform part of the field, each axis [nT]."""
-
-    kernel: Kernel = "se"
-    """Kernel of the scalar potential, or of the field magnitude: "se", "matern32" or "matern52"."""
-
-    margin_m: float = 1.0
-    """Space between the floor's extent and the border of the eigenfunctions' box [m]."""
-
-    field: Literal["auto", "vector", "scalar"] = "auto"
-    """Readings to use: three axes, the magnitude, or three axes if the first reading has them."""
 
     odometry_axes: Literal["body", "world"] = "body"
     """Axes in which odometry's increments are right: those of the robot, or of the world.
@@ -56,7 +46,7 @@ class Settings:
     """Random walk of odometry's roll and pitch [rad/sqrt(s)], for three axes."""
 
     def __post_init__(self) -> None:
-        for name in ("length_m", "sd_nt", "uniform_sd_nt", "margin_m", "vertical_std_s", "tilt_std_s"):
+        for name in ("length_m", "sd_nt", "uniform_sd_nt", "vertical_std_s", "tilt_std_s"):
             _refuse(name, getattr(self, name), 0.0, above=True)
         for name in ("velocity_sd_m_s", "soft_iron_sd"):
             _refuse(name, getattr(self, name), 0.0)
@@ -64,12 +54,9 @@ class Settings:
             raise InputError(
                 f"functions must be a whole number from 1, got {self.functions}", parameter="functions"
             )
-        smoothness(self.kernel)
-        for name, known in (("field", ("auto", "vector", "scalar")), ("odometry_axes", ("body", "world"))):
-            if getattr(self, name) not in known:
-                raise InputError(
-                    f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}", parameter=name
-                )
+        if self.odometry_axes not in ("body", "world"):
+            text = f"odometry_axes must be body or world, got {self.odometry_axes!r}"
+            raise InputError(text, parameter="odometry_axes")
 
 
 def _refuse(name: str, value: float, least: float, *, above: bool = False) -> None:

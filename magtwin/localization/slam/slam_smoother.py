@@ -11,7 +11,7 @@ from magtwin.localization.readings import readings_of
 from magtwin.localization.slam.batch import FAR, NEAR, Batch
 from magtwin.localization.slam.incremental_slam import IncrementalSlam
 from magtwin.localization.slam.model import Model, State
-from magtwin.localization.slam.samples import is_vector, samples_of
+from magtwin.localization.slam.samples import has_vector, samples_of
 from magtwin.localization.slam.settings import Settings
 from magtwin.run.run import Run
 
@@ -35,20 +35,17 @@ class SlamSmoother(Settings):
     """Prior standard deviation of each entry of the soft-iron matrix W, for three axes. 0: no W."""
 
     starts: int = 2
-    """Starts to try: dead reckoning; the incremental filter's trajectory; dead reckoning with a velocity
-    error of one prior standard deviation along x, -x, y and -y (these if `velocity_sd_m_s` is above 0)."""
+    """Starts to try: dead reckoning; and the incremental filter's trajectory."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (isinstance(self.starts, int) and 1 <= self.starts <= 6):
-            raise InputError(
-                f"starts must be a whole number from 1 to 6, got {self.starts}", parameter="starts"
-            )
+        if self.starts not in (1, 2):
+            raise InputError(f"starts must be 1 or 2, got {self.starts}", parameter="starts")
 
     def run(self, problem: Problem, readings: Run) -> list[Estimate]:
         """Estimates at the times of all readings."""
         rows = list(readings_of(readings))
-        vector = is_vector(self.field, rows[0])
+        vector = has_vector(rows[0])
         samples = samples_of(rows, vector)
         self.model = Model(problem, self, samples.take(slice(0, 1)), vector)
         batch = Batch(self.model, samples)
@@ -58,9 +55,8 @@ class SlamSmoother(Settings):
             if cost < least or best is None:
                 best, least = state, cost
         assert best is not None
-        self.state, self.cost = best, least
-        solution, self.evidence = batch.posterior(best)
-        covariance = solution.pose_covariances()
+        self.state = best
+        covariance = batch.linearised(best)[0].solve().pose_covariances()
         return [
             self.model.estimate(t, best.p[k], best.R[k], covariance[k], best.drift[k])
             for k, t in enumerate(samples.t.tolist())
@@ -71,20 +67,13 @@ class SlamSmoother(Settings):
     ) -> Iterator[tuple[State, tuple[tuple[float, int], ...]]]:
         """Trajectories to start from, and how to anneal the noise."""
         yield batch.dead_reckoning(), FAR
-        zero = np.zeros(self.model.layout.count)
         if self.starts > 1:
             shared = {f.name: getattr(self, f.name) for f in fields(Settings) if f.name not in OWN}
             causal = IncrementalSlam(**shared)
             causal.reset(problem)
             for row in rows:
                 causal.step(row)
-            yield causal.trajectory()[1]._replace(g=zero), NEAR
-        sd, place = self.velocity_sd_m_s, self.model.layout.velocity
-        for x, y in ((sd, 0.0), (-sd, 0.0), (0.0, sd), (0.0, -sd))[: max(0, self.starts - 2)]:
-            if sd > 0:
-                g = zero.copy()
-                g[place] = x, y
-                yield batch.dead_reckoning(g), NEAR
+            yield causal.trajectory()[1]._replace(g=np.zeros(self.model.layout.count)), NEAR
 
 
 OWN = ("functions", "soft_iron_sd")

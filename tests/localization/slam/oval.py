@@ -37,7 +37,7 @@ def oval(*, rows=240, seed=0, vector=True):
     if vector:
         functions = basis([-2.5, -1.9, -1.0], [2.5, 1.9, 1.0], 60)
         weights = rng.standard_normal(60) * np.sqrt(
-            functions.variances("se", sd=SD_NT * LENGTH_M, length_m=LENGTH_M)
+            functions.variances(sd=SD_NT * LENGTH_M, length_m=LENGTH_M)
         )
         world = functions.gradients(p) @ weights + UNIFORM_NT
         b = (R.transpose(0, 2, 1) @ world[..., None])[..., 0] + OFFSET_NT
@@ -45,7 +45,7 @@ def oval(*, rows=240, seed=0, vector=True):
         columns = {"b_vector_measured_nt": b, "b_measured_nt": np.linalg.norm(b, axis=1)}
     else:
         functions = basis([-2.5, -1.9], [2.5, 1.9], 60)
-        weights = rng.standard_normal(60) * np.sqrt(functions.variances("se", sd=SD_NT, length_m=LENGTH_M))
+        weights = rng.standard_normal(60) * np.sqrt(functions.variances(sd=SD_NT, length_m=LENGTH_M))
         b = functions.values(p[:, :2]) @ weights + 45_000 + WHITE_NT * rng.standard_normal(rows)
         columns = {"b_measured_nt": b}
     t = np.arange(rows) / RATE_HZ

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from oval import first_readings, oval
 from scipy.optimize import least_squares
 
-from magtwin.localization.slam.arrow import Arrow
+from magtwin.localization.arrow import Arrow
 from magtwin.localization.slam.batch import Batch
 from magtwin.localization.slam.model import Model
 from magtwin.localization.slam.samples import samples_of
@@ -42,7 +42,6 @@ def test_an_arrow_is_solved_as_the_dense_matrix(count, size, constants):
     expected = np.linalg.solve(dense, right)
     assert_allclose(solution.x.ravel(), expected[:poses], rtol=1e-8, atol=1e-10)
     assert_allclose(solution.g, expected[poses:], rtol=1e-8, atol=1e-10)
-    assert_allclose(solution.log_determinant(), np.linalg.slogdet(dense)[1], rtol=1e-10)
     blocks = inverse[:poses, :poses].reshape(count, size, count, size)
     last = [*range(poses - size, poses), *range(poses, poses + constants)]
     assert_allclose(solution.last_covariance(), inverse[np.ix_(last, last)], rtol=1e-7, atol=1e-10)
@@ -67,7 +66,7 @@ def test_the_solution_is_that_of_scipy(vector):
     model = Model(problem, settings, samples.take(slice(0, 1)), vector)
     batch = Batch(model, samples)
     start = batch.fit_constants(batch.dead_reckoning())
-    found, cost = batch.iterate(start, 60)
+    found, cost, _ = batch.solved(start, 60)
     spread = np.sqrt(model.constants_variance)
 
     def residuals(x):
@@ -80,7 +79,7 @@ def test_the_solution_is_that_of_scipy(vector):
     )
     assert cost == pytest.approx(peer.cost, abs=2e-3)  # iterations end at a fall of 1e-3
     best = model.add(start, peer.x[: 9 * model.size].reshape(9, -1), spread * peer.x[9 * model.size :])
-    solution, _ = batch.posterior(found)
+    solution = batch.linearised(found)[0].solve()
     sd = np.sqrt(np.diagonal(solution.pose_covariances(), axis1=1, axis2=2))
     assert (np.abs(model.difference(found, best)) < 0.1 * sd).all()  # 1e-3 of cost is 0.045 sd
     dense = np.linalg.inv(peer.jac.T @ peer.jac)[: 9 * model.size, : 9 * model.size]

@@ -121,8 +121,8 @@ def test_an_unknown_start_is_refused():
 
 @pytest.mark.parametrize(
     "options",
-    [{"functions": 0}, {"functions": 2.5}, {"length_m": 0.0}, {"sd_nt": np.nan}, {"kernel": "gauss"},
-     {"odometry_axes": "odom"}, {"field": "both"}, {"soft_iron_sd": -1.0}],
+    [{"functions": 0}, {"functions": 2.5}, {"length_m": 0.0}, {"sd_nt": np.nan},
+     {"odometry_axes": "odom"}, {"soft_iron_sd": -1.0}],
 )  # fmt: skip
 def test_wrong_options_are_refused(options):
     with pytest.raises(InputError, match=next(iter(options))):

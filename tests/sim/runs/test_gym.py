@@ -13,8 +13,6 @@ from gymnasium.vector import SyncVectorEnv  # noqa: E402
 import magtwin.gym  # noqa: E402
 from magtwin.errors import InputError  # noqa: E402
 from magtwin.run.run import COLUMNS  # noqa: E402
-from magtwin.sim.runs.stepped import SteppedRobots  # noqa: E402
-from magtwin.sim.session import draw_session  # noqa: E402
 
 NAME = "magtwin/MagNav-v0"
 AHEAD = np.array([0.2, 0.0], np.float32)
@@ -54,17 +52,6 @@ def test_gymnasiums_checker_passes(twin, session):
     check_env(gymnasium.make(NAME, scene=twin, session=session).unwrapped)
 
 
-def test_robots_on_a_survey_alone_read_its_map_and_their_own_field(twin):
-    bare = replace(twin, scene=replace(twin.scene, earth=None, sources=(), furniture=()))
-    env = vector(bare, 3)
-    env.reset(seed=1)
-    for _ in range(5):
-        env.step(np.tile(AHEAD, (3, 1)))
-    table = env.unwrapped.stepped.columns
-    assert np.isfinite(table["b_total_nt"]).all()
-    assert (np.abs(table["b_disturbance_nt"]) > 10).all(), "of drawn sessions, in motion"
-
-
 def test_each_episode_is_a_session_of_its_own_unless_that_of_the_survey_is_wanted(twin):
     names = ("battery_fraction", "imu_q_xyzw", "b_total_nt")
     for session in ("drawn", "survey"):
@@ -78,30 +65,6 @@ def test_each_episode_is_a_session_of_its_own_unless_that_of_the_survey_is_wante
         assert apart > 0.02 if session == "drawn" else apart < 0.01
         field = np.concatenate([column(env, o, "b_total_nt").ravel() for o in (first, again)])
         assert np.ptp(field) > 50 if session == "drawn" else np.ptp(field) < 1
-
-
-def test_robots_of_many_days_do_together_what_each_does_in_a_scene_of_its_day(twin):
-    days = [draw_session(twin.scene.robot, np.random.default_rng(day)) for day in range(6)]
-    poses = [(-2.0 + 0.5 * i, -1.2, 0.3 * i) for i in range(6)]
-    common = {"anomaly_map": twin.field, "obstacles": twin.obstacles, "step_s": 0.1}
-
-    def driven(robots, which):
-        robots.begin(
-            list(range(len(which))),
-            [poses[i] for i in which],
-            [np.random.default_rng(i) for i in which],
-            None if len(which) == 1 else days,
-        )
-        for k in range(12):
-            robots.step(np.tile([0.2, 0.05 * k], (len(which), 1)))
-        return robots.columns
-
-    together = driven(SteppedRobots(twin.scene, 6, **common), range(6))
-    assert 0 < together["lidar_on"].sum() < 6
-    for i, day in enumerate(days):
-        alone = driven(SteppedRobots(replace(twin.scene, robot=day), 1, **common), [i])
-        for name, values in alone.items():
-            assert_allclose(together[name][i], values[0], rtol=1e-9, atol=1e-9, err_msg=name)
 
 
 def test_one_seed_is_one_episode_and_another_seed_another(twin):
@@ -173,17 +136,6 @@ def test_the_field_is_the_exact_one_of_a_run_at_the_same_pose(twin, line):
     assert_allclose(observation[0], run["b_total_nt"][0], atol=5.0)  # electronics
 
 
-def test_an_episode_is_truncated_by_time_and_not_before(twin):
-    env = vector(twin, 2, duration_s=1.0)
-    env.reset(seed=0)
-    cuts = [env.step(np.zeros((2, 2), np.float32))[3].all() for _ in range(10)]
-    assert cuts == [False] * 9 + [True]
-    _, rewards, ended, truncated, _ = env.step(np.zeros((2, 2), np.float32))
-    assert not rewards.any()
-    assert not ended.any()
-    assert not truncated.any()
-
-
 def test_a_bump_is_told_and_ends_the_episode_where_that_is_asked_for(twin, tmp_path):
     (tmp_path / "out.csv").write_text("2.0,0.0\n2.5,0.0\n")
     for end in (False, True):
@@ -234,18 +186,6 @@ def test_a_reward_of_ones_own_is_asked_for_each_step(twin):
 def test_bad_options_are_refused(twin, options, text):
     with pytest.raises(InputError, match=text):
         magtwin.gym.MagNavEnv(**{"scene": twin, **options})
-
-
-def test_commands_that_are_not_finite_are_refused(twin):
-    env = magtwin.gym.MagNavEnv(scene=twin)
-    env.reset(seed=0)
-    with pytest.raises(InputError, match="must be finite"):
-        env.step([np.nan, 0.0])
-
-
-def test_seeds_must_be_as_many_as_robots(twin):
-    with pytest.raises(InputError, match="one seed for each of the 2 robots, got 3"):
-        magtwin.gym.MagNavVectorEnv(2, scene=twin).reset(seed=[0, 1, 2])
 
 
 def test_a_reward_of_the_wrong_shape_is_refused(twin):

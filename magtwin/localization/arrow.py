@@ -26,7 +26,7 @@ def gram(flat: Array) -> Array:
     return np.asarray(np.triu(upper) + np.triu(upper, 1).T)
 
 
-LOOPS = Loops("magtwin.localization.slam.arrow_loops", pays=0)
+LOOPS = Loops("magtwin.localization.arrow_loops", pays=0)
 """Compiled loops; plain Python would take seconds for each system."""
 
 
@@ -48,6 +48,13 @@ class Arrow:
 
     right: Array
     """c, shape (G,)."""
+
+    def damped(self, factor: float) -> "Arrow":
+        """A copy with the diagonal of the matrix grown by a factor (Marquardt 1963)."""
+        diagonal, corner = self.diagonal.copy(), self.corner.copy()
+        diagonal[:, range(diagonal.shape[1]), range(diagonal.shape[1])] *= 1 + factor
+        corner[range(len(corner)), range(len(corner))] *= 1 + factor
+        return Arrow(diagonal, self.below.copy(), self.border.copy(), corner, self.right)
 
     def solve(self) -> "Solution":
         """Solve the system. It overwrites the blocks.
@@ -89,11 +96,6 @@ class Solution:
 
     factor: Array
     """Cholesky factor of C - Y'Y, lower, shape (G, G)."""
-
-    def log_determinant(self) -> float:
-        """Logarithm of the determinant of the matrix."""
-        poses = -2 * np.log(np.diagonal(self.diagonal, axis1=1, axis2=2)).sum()
-        return float(poses + 2 * np.log(np.diagonal(self.factor)).sum())
 
     def pose_covariances(self) -> Array:
         """Diagonal blocks of the poses' part of the inverse, shape (N, D, D)."""

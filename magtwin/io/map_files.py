@@ -1,0 +1,47 @@
+"""Files of maps: a layer, a stage, a folder of survey CSVs, or the name of a shipped scene."""
+
+import os
+from pathlib import Path
+
+from magtwin.errors import InputError
+from magtwin.field.maps.map import AnomalyMap
+from magtwin.files.file import existing
+from magtwin.files.kinds import expected, scene_file
+
+Source = str | os.PathLike[str]
+
+
+def open_map(file: Source) -> AnomalyMap:
+    """The map of a layer or stage, or of a folder of survey CSVs.
+
+    Args:
+        file: As for `map_file`.
+
+    Raises:
+        InputError: There is no map, or it is damaged.
+    """
+    from magtwin.field.survey.folder import read_survey
+    from magtwin.usd.maps.layer import load_map
+
+    file = map_file(file)
+    if not file.is_dir():
+        return load_map(file)
+    return read_survey(expected(file, "map"))[0]
+
+
+def map_file(source: Source) -> Path:
+    """The file of a map: a layer, a stage, a folder of CSVs or of a scene, or the stage of a shipped scene.
+
+    Raises:
+        InputError: There is no such file or scene.
+    """
+    path = Path(source)
+    if path.is_file() or (path.is_dir() and not (path / f"{path.resolve().name}.usda").is_file()):
+        return path
+    if path.suffix or (len(path.parts) > 1 and not path.exists()):
+        return existing(path, "map")
+    try:
+        return scene_file(path)
+    except InputError as error:
+        text = f"{source}: no map layer, stage, folder of CSVs or shipped scene: {error}"
+        raise InputError(text) from error
