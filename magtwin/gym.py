@@ -30,7 +30,7 @@ from magtwin.sim.session import draw_session
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.scene import Scene
 from magtwin.twin import Kind, Twin, room_of, with_plant
-from magtwin.twin.opening import opened
+from magtwin.twin.twin import opened
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer

@@ -10,6 +10,7 @@ from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.files.file import shipped
 from magtwin.twin import in_session, in_session_of, open_twin, simulate, sweep
+from magtwin.twin.opening import geometry
 
 
 def test_a_run_is_in_a_session_of_its_seed_unless_another_is_chosen(lab_scene):
@@ -105,15 +106,15 @@ def test_a_shipped_scene_is_opened_by_its_name(tmp_path, monkeypatch):
 
 def test_a_twin_opens_its_stage_once_and_survives_another_process(lab_scene, monkeypatch):
     twin = open_twin(lab_scene, magnetometer="physical")
-    shapes, links = twin.geometry()
+    shapes, links = geometry(twin)
     copy = pickle.loads(pickle.dumps(twin))
     assert copy.opened is None
-    assert copy.geometry()[1].keys() == links.keys()
-    assert len(copy.geometry()[0]) == len(shapes)
+    assert geometry(copy)[1].keys() == links.keys()
+    assert len(geometry(copy)[0]) == len(shapes)
     run = simulate(twin, duration_s=0.5, rate_hz=5.0)
     monkeypatch.setattr("magtwin.usd.layers.open_stage", lambda *_: pytest.fail("opened the stage again"))
     monkeypatch.setattr("magtwin.usd.scene.open_stage", lambda *_: pytest.fail("opened the stage again"))
-    assert twin.geometry()[1] is links
+    assert geometry(twin)[1] is links
     assert run.rows
 
 

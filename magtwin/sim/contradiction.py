@@ -6,8 +6,8 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.sim.at_rest import field_at_rest_nt, in_steel, sensor_height_m
 from magtwin.sim.interference import ambient_gradient_nt_m
-from magtwin.sim.survey import field_at_rest_nt, in_steel, sensor_height_m
 from magtwin.spec.scene import Scene
 
 LEAST_NT = 500.0

@@ -1,7 +1,8 @@
 """Simulate: a twin and a path become a Run."""
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
+import importlib
+from collections.abc import Callable, Iterable
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -15,22 +16,8 @@ from magtwin.run.run import Run
 from magtwin.sim.motion.drive_input import drive_input
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.scene import Scene
-from magtwin.twin.opening import led_by, open_twin, opened
-from magtwin.twin.twin import (
-    OF_SCENE,
-    Kind,
-    Metadata,
-    Session,
-    Twin,
-    checked_seed,
-    in_session,
-    in_session_of,
-    model_error_of,
-    room_of,
-    scene_sha256,
-    trained_on,
-    with_plant,
-)
+from magtwin.twin.session import in_session, in_session_of, model_error_of, room_of, trained_on, with_plant
+from magtwin.twin.twin import OF_SCENE, Kind, Metadata, Session, Twin, checked_seed, opened, scene_sha256
 from magtwin.version import __version__
 
 if TYPE_CHECKING:
@@ -41,6 +28,10 @@ if TYPE_CHECKING:
     from magtwin.sim.motion.engine import Engine
     from magtwin.sim.runs.simulate import Predict
     from magtwin.sim.sensors.lidar import Scans
+
+
+_ON_STAGE = {"newton": "magtwin.twin.physics:newton"}
+"""Engines that need the stage, and what makes them of a twin."""
 
 
 def simulate(
@@ -132,7 +123,7 @@ def simulate(
         speed=speed,
         duration_s=duration_s,
         rate_hz=rate_hz,
-        disturbance_nt=_predict(twin, reads),
+        disturbance_nt=predictor_of(twin, reads),
         model_error=model_error_of(twin, seed),
         outside=outside,
         lidar=lidar,
@@ -149,112 +140,6 @@ def simulate(
     return run
 
 
-def simulate_robots(
-    twin: Twin | Scene | str | FilePath,
-    paths: "Mapping[str, Path | Commands | Run | str | FilePath | ArrayLike] | None" = None,
-    *,
-    robots: Iterable[str] | None = None,
-    meet: Literal["refuse", "flag"] = "refuse",
-    seed: int = 0,
-    session: Session | None = None,
-    plant: PlantSpec | str | None = None,
-    speed: float = 0.2,
-    duration_s: float | None = None,
-    rate_hz: float | None = None,
-    network: str | FilePath | None = None,
-    magnetometer: Kind | None = None,
-    model_error: bool = True,
-    lidar: Literal["schedule", "on", "off"] = "schedule",
-    outside: Literal["nan", "clamp", "raise"] = "nan",
-    controller: str = "follower",
-    progress: Callable[[int, int, str], Any] | None = None,
-    each: Callable[[str, Run], Any] | None = None,
-) -> dict[str, Run]:
-    """Drive all robots of a scene at the same time. Each robot gets a Run.
-
-    Each magnetometer also reads the iron of the other robots. The first robot draws what `simulate` draws
-    with the same seed; each other robot has a generator of its own.
-
-    Args:
-        twin: An opened twin, a `Scene`, or the file of a stage.
-        paths: What each robot drives, by name, as for `simulate`. Default: the path in the scene, else
-            "figure8".
-        robots: Names of the robots whose sensors are read. Default: all. All robots drive.
-        meet: What happens where footprints overlap: "refuse" raises an error with time and place; "flag"
-            sets flag_bump of both robots, which then drive through each other.
-        seed: As for `simulate`.
-        session: As for `simulate`; each robot is drawn independently.
-        plant: As for `simulate`; each robot has constants of its own.
-        speed: As for `simulate`, of each robot.
-        duration_s: As for `simulate`, of each robot.
-        rate_hz: As for `simulate`.
-        network: As for `open_twin`, if `twin` is a file; of each robot.
-        magnetometer: As for `open_twin`, if `twin` is a file; of each robot.
-        model_error: As for `simulate`.
-        lidar: As for `simulate`.
-        outside: As for `simulate`.
-        controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`.
-        progress: As for `simulate`, of each long run in turn.
-        each: As for `simulate`, called with the robot's name and each block of its run.
-
-    Returns:
-        Runs by robot name, in the scene's order. The metadata of each also name the robot, the nearest other
-        robot, and the time and clearance of their closest approach.
-
-    Raises:
-        InputError: A name is not that of a robot, robots would meet, or `simulate` would refuse one of them.
-    """
-    from magtwin.sim.exact import check_field, check_read
-    from magtwin.sim.runs.multi_robot import simulate_robots as run_robots
-
-    seed = checked_seed(seed)
-    twin = opened(twin, network, magnetometer, model_error, "simulate_robots")
-    twin = in_session(with_plant(twin, plant), session, seed=seed)
-    check_field(twin.scene, twin.field)
-    placed = {other.robot.name: other for other in twin.scene.robots}
-    for name in (*(paths or {}), *(robots or ())):
-        find("robot", name, placed)
-    twins = {name: led_by(twin, name) for name in placed}
-    driven = {
-        name: drive_input((paths or {}).get(name, robot.path or "figure8"), room_of(twins[name]))
-        for name, robot in placed.items()
-    }
-    for name, path in driven.items():
-        check_commands(path, twins[name].magnetometer)
-    reads: dict[str, list[Read]] = {name: [] for name in placed}
-    hashes = {name: scene_sha256(own.scene) for name, own in twins.items()}
-    paths_said = {name: path_metadata(path) for name, path in driven.items()}
-
-    def complete(name: str, block: Run) -> Run:
-        read = reads[name].pop() if reads[name] else None
-        known: Any = {"seed": seed, "duration_s": duration_s, "config_sha256": hashes[name]}
-        return finished(twins[name], block, paths_said[name], read, **known)
-
-    runs = run_robots(
-        twin.scene,
-        driven,
-        anomaly_map=twin.field,
-        rngs={name: np.random.default_rng((seed, 2, k) if k else seed) for k, name in enumerate(placed)},
-        wanted=[name for name in placed if robots is None or name in set(robots)],
-        meet=meet,
-        speed=speed,
-        duration_s=duration_s,
-        rate_hz=rate_hz,
-        obstacles=twin.obstacles,
-        controller=controller,
-        disturbances_nt={name: _predict(own, reads[name]) for name, own in twins.items()},
-        model_errors={name: model_error_of(twins[name], seed, which=k) for k, name in enumerate(placed)},
-        outside=outside,
-        lidar=lidar,
-        complete=complete,
-        progress=progress,
-        each=each,
-    )
-    for run in runs.values():
-        check_read(run, twin.field)
-    return runs
-
-
 def scan(twin: Twin | Scene | str | FilePath, run: Run, *, seed: int = 0) -> "Scans":
     """The scans of the robot's LiDAR during a run, one per revolution while it was on.
 
@@ -267,7 +152,7 @@ def scan(twin: Twin | Scene | str | FilePath, run: Run, *, seed: int = 0) -> "Sc
     from magtwin.sim.sensors.lidar import scans_of
 
     if not isinstance(twin, Twin):
-        twin = in_session_of(open_twin(twin, magnetometer="map-only"), run.metadata)
+        twin = in_session_of(opened(twin, None, "map-only", True, "scan"), run.metadata)
     rng = streams(np.random.default_rng(seed))["lidar"]
     return scans_of(run, twin.scene.robot, twin.obstacles, rng)
 
@@ -285,19 +170,14 @@ def engine_named(
     Raises:
         InputError: No engine has that name, or it is not installed; the text names the extra.
     """
-    from magtwin.sim.engines.newton import Newton, check_installed
     from magtwin.sim.motion.engine import ENGINES
 
-    find("engine", name, dict.fromkeys([*ENGINES, "newton"]))
-    if name != "newton":
+    find("engine", name, dict.fromkeys([*ENGINES, *_ON_STAGE]))
+    if name not in _ON_STAGE:
         return ENGINES[name]
-    check_installed()
-    placed, robot = "", twin.scene.robot
-    if {"lab", "lab_pose"} & twin.metadata.keys():
-        from magtwin.usd.scene import as_layer, open_alone
-
-        placed = as_layer(open_alone(twin.scene_file, robot.name, lab=str(twin.metadata.get("lab", ""))))
-    return Newton(twin.scene_file, robot, progress, placed=placed)
+    module, _, function = _ON_STAGE[name].partition(":")
+    engine: Engine = getattr(importlib.import_module(module), function)(twin, progress)
+    return engine
 
 
 def path_metadata(path: "Path | Commands | Run | str") -> Metadata:
@@ -376,7 +256,7 @@ def check_commands(path: "Path | Commands | Run | str", network: "NeuralMagnetom
             )
 
 
-def _predict(twin: Twin, reads: "list[Read]") -> "Predict | None":
+def predictor_of(twin: Twin, reads: "list[Read]") -> "Predict | None":
     """A function that predicts the disturbance of a run and appends what the network read to `reads`."""
     network, known = twin.magnetometer, [trained_on(twin)]
     if network is None:

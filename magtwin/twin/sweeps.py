@@ -19,20 +19,9 @@ from magtwin.sim.motion.drive_input import drive_inputs
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
-from magtwin.twin.opening import opened
+from magtwin.twin.session import in_session, model_error_of, room_of, trained_on, with_plant
 from magtwin.twin.simulation import check_commands, finished
-from magtwin.twin.twin import (
-    Kind,
-    Twin,
-    checked_seed,
-    in_session,
-    model_error_of,
-    room_of,
-    scene_sha256,
-    trained_on,
-    with_plant,
-    without_model_error,
-)
+from magtwin.twin.twin import Kind, Twin, checked_seed, opened, scene_sha256, without_model_error
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer

@@ -14,8 +14,8 @@ from magtwin.field.sources.magnets import body_of
 from magtwin.files.file import shipped
 from magtwin.files.settings import from_table, read_toml
 from magtwin.path import path_named
+from magtwin.sim.at_rest import field_at_rest_nt
 from magtwin.sim.runs.simulate import simulate
-from magtwin.sim.survey import field_at_rest_nt
 from magtwin.spec.magnetics import EarthFieldSpec
 from magtwin.usd.maps.layer import load_map
 

@@ -11,8 +11,9 @@ from magtwin.field.maps.difference import difference
 from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.field.sources.magnets import body_of
 from magtwin.frames import quat_from_yaw, rotate
+from magtwin.sim.at_rest import field_at_rest_nt
 from magtwin.sim.interference import ambient_gradient_nt_m
-from magtwin.sim.survey import field_at_rest_nt, pose_error_nt2, survey, survey_readings
+from magtwin.sim.survey import pose_error_nt2, survey, survey_readings
 from magtwin.spec.lab import LabSpec
 from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
 from magtwin.spec.robot import RobotSpec

@@ -1,7 +1,7 @@
 """Error budget: how much of a model's error is map, lever arm, latency, sessions, platform and sensor.
 
 On a twin everything is known, so a model's error e = map + f - measured can be decomposed exactly. Let r be
-the field of the surveying robot at rest (`magtwin.sim.survey.field_at_rest_nt`), r' that of the robot in the
+the field of the surveying robot at rest (`magtwin.sim.at_rest.field_at_rest_nt`), r' that of the robot in the
 run's session, p the measured and aligned pose, p* the same with the true lever arm, and q the true pose:
 
     map         D1 = map(p) - r(p)              error of the map
@@ -199,7 +199,7 @@ class Truth:
     def at_rest(self, p_xy: Array, yaw: Array, scene: Scene | None = None) -> Array:
         """Exact field magnitude at the magnetometer of a robot at rest with its LiDAR off [nT].
 
-        It is that of `magtwin.sim.survey.field_at_rest_nt` within 1e-3 nT.
+        It is that of `magtwin.sim.at_rest.field_at_rest_nt` within 1e-3 nT.
 
         Args:
             p_xy: Positions of base_link [m], shape (N, 2).
