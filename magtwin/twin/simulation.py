@@ -79,8 +79,7 @@ def simulate(
         model_error: Whether readings of a neural magnetometer include model error; see `open_twin`.
         lidar: Whether the LiDAR follows its schedule, or stays on or off.
         outside: What the map reads outside its extent: nan, the nearest value inside, or an error.
-        controller: "follower", "release", "stanley" or "pure_pursuit", or a custom
-            `magtwin.sim.motion.controllers.Controller`.
+        controller: "follower" or "release", or a custom `magtwin.sim.motion.controllers.Controller`.
         engine: "kinematic"; "newton" for physics in the stage (`magtwin[physics]`); the name of a registered
             engine; or a custom `magtwin.sim.motion.engine.Engine`.
         sensors: Custom sensors: names of registered sensors, or functions that make a sensor. Their columns

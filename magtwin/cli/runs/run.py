@@ -92,7 +92,7 @@ def run(
     meet: Literal["refuse", "flag"] | None = None,
     engine: Literal["kinematic", "newton"] = "kinematic",
     replay: Path | None = None,
-    controller: Literal["follower", "release", "stanley", "pure_pursuit"] = "follower",
+    controller: Literal["follower", "release"] = "follower",
     sensing: SensingOptions = SENSING,
     seed: Seed = 0,
     session: Session = None,
@@ -136,8 +136,7 @@ def run(
         File of a run, in any format. The robot repeats the recorded motion; the sensors use the current
         settings.
     controller
-        follower (magtwin's own controller), release (that of APRILab's published package), stanley or
-        pure_pursuit.
+        follower (magtwin's own controller) or release (that of APRILab's published package).
     speed
         Forward speed on straight parts [m/s].
     duration_s

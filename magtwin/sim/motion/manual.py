@@ -6,11 +6,9 @@ from typing import Protocol
 
 import numpy as np
 
-from magtwin.sim.motion.closed_loop import Chassis, ClosedLoop
+from magtwin.sim.motion.closed_loop import Chassis
 from magtwin.sim.motion.commands import Commands
-from magtwin.sim.motion.controllers import guide_by_commands
 from magtwin.spec.drive import DriveSpec
-from magtwin.spec.obstacles import Obstacles
 
 V_STEP, W_STEP = 0.05, 0.25
 """Change of speed [m/s] and yaw rate [rad/s] by one key press."""
@@ -141,28 +139,3 @@ class Recorder:
         """All commands, one row per control step, and a stop at the end."""
         rows: Sequence[tuple[float, float, float]] = [*self._rows, (len(self._rows) * self._dt, 0.0, 0.0)]
         return Commands(name, np.array(rows))
-
-
-def at_start(
-    drive: DriveSpec,
-    start: tuple[float, float, float],
-    obstacles: Obstacles,
-    footprint_radius_m: float,
-    wheel_errors: tuple[float, float],
-    dt: float,
-) -> Chassis:
-    """A robot to be driven by hand, at rest at `start`.
-
-    Raises:
-        InputError: It would begin in an obstacle.
-    """
-    course = ClosedLoop(
-        drive=drive,
-        guide=guide_by_commands([[0.0, 0.0, 0.0]], drive),
-        dt=dt,
-        pose0=start,
-        steps=1,
-        footprint_radius_m=footprint_radius_m,
-        wheel_errors=wheel_errors,
-    )
-    return Chassis(course, obstacles)

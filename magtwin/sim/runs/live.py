@@ -15,8 +15,7 @@ from magtwin.run.run import Run
 from magtwin.sim.motion.closed_loop import Chassis
 from magtwin.sim.motion.commands import Commands
 from magtwin.sim.motion.drive import Moment, draw_wheel_errors, moment_in_steps, wheel_rates
-from magtwin.sim.motion.follow import CONTROL_RATE_HZ
-from magtwin.sim.motion.manual import at_start
+from magtwin.sim.motion.follow import CONTROL_RATE_HZ, STAND, loop_by_commands
 from magtwin.sim.runs.neighbours import Neighbour
 from magtwin.sim.runs.sensing import Conditions, LidarMode, Sensing, streams
 from magtwin.sim.runs.simulate import check_run, run_metadata
@@ -126,7 +125,8 @@ class LiveRobot:
         draws = streams(rng)
         errors = draw_wheel_errors(robot.drive, draws["drive"])
         radius = robot.footprint_radius_m
-        self._chassis: Chassis = at_start(robot.drive, scene.start, obstacles, radius, errors, self.step_s)
+        start: Any = {"start": scene.start, "footprint_radius_m": radius, "wheel_errors": errors}
+        self._chassis = Chassis(loop_by_commands(STAND, robot.drive, **start), obstacles)
         self._track = Track(robot.drive, self.step_s, scene.start)
         self._network, self._model_error, self._height_m = network, model_error, robot.base_height_m
         self._robot, self._neighbours = robot, list[Neighbour]()
@@ -182,10 +182,9 @@ class LiveRobot:
         begin = self._track.end_s
         if begin == 0:
             command = (0.0, 0.0)
-        self._chassis.step(command)
+        self._track.add(self._chassis.step(command))
         if command is not None and begin > 0:
             self._commands.extend((begin, *command))
-        self._track.add(self._chassis.last)
 
     def scans(self) -> Scans:
         """The LiDAR's scans whose time lay in the last step, with the times at which they will arrive."""

@@ -75,6 +75,8 @@ class Conditions:
 
     anomaly_map: AnomalyMap
     obstacles: Obstacles = field(default_factory=Obstacles)
+    """What paths must be clear of, what stops robots, and what their LiDARs see."""
+
     network: bool
     """Whether a network predicts the disturbance."""
 
@@ -82,11 +84,18 @@ class Conditions:
     """Columns that the network reads."""
 
     duration_s: float | None = None
+    """How long to drive [s]. None for once along the path."""
+
     rate_hz: float | None = None
+    """Magnetometer readings a second [Hz]. None for the scene's."""
+
     controller: str | Controller = "follower"
     engine: Engine = KINEMATIC
     lidar: LidarMode = "schedule"
+    """Whether the LiDAR follows its schedule, or stays on or off."""
+
     outside: Outside = "nan"
+    """What the map reads outside its extent: nan, the nearest value inside, or a refusal."""
 
 
 def streams(rng: np.random.Generator) -> dict[str, np.random.Generator]:

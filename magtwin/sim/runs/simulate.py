@@ -12,31 +12,19 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.path import Path, check_on_floor
 from magtwin.run.run import Run
 from magtwin.run.spool import Spool
-from magtwin.sim.engines.replay import replayed
 from magtwin.sim.exact import check_truth
 from magtwin.sim.extensions import Interference, SensorFactory
-from magtwin.sim.motion.commands import Commands
-from magtwin.sim.motion.controllers import Controller
-from magtwin.sim.motion.drive import draw_wheel_errors
 from magtwin.sim.motion.drive_input import DriveInput
-from magtwin.sim.motion.driver import Driver
-from magtwin.sim.motion.engine import KINEMATIC, Engine, Travel
-from magtwin.sim.motion.follow import follow, play
-from magtwin.sim.motion.pose_error import draw_pose_error
-from magtwin.sim.runs.sensing import Conditions, LidarMode, Outside, Predicted, Sensing, streams
+from magtwin.sim.motion.engine import Travel
+from magtwin.sim.runs.driving import Metadata, Trip, course_of, drive
+from magtwin.sim.runs.sensing import Conditions, Predicted, Sensing, streams
 from magtwin.sim.sensors.lidar import lidar_on
 from magtwin.sim.sensors.model_error import ModelError
-from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 
-Metadata = dict[str, str | int | float | bool]
-
 Predict = Callable[[Run], Predicted]
 """From a Run to what a network predicts for it."""
-
-RANDOM_S = 60.0
-"""Default time for which a random driver drives [s]."""
 
 HIGHEST_HZ = 10_000.0
 """Highest rate of a sensor beside the magnetometer [Hz]."""
@@ -61,22 +49,16 @@ def simulate(
     anomaly_map: AnomalyMap,
     rng: np.random.Generator,
     speed: float = 0.2,
-    duration_s: float | None = None,
-    rate_hz: float | None = None,
-    obstacles: Obstacles | None = None,
-    controller: str | Controller = "follower",
     disturbance_nt: Predict | None = None,
     model_error: ModelError | None = None,
-    outside: Outside = "nan",
-    lidar: LidarMode = "schedule",
-    engine: Engine | None = None,
     sensors: Iterable[str | SensorFactory] = (),
     interference: Iterable[str | Interference] = (),
     complete: Callable[[Run], Run] = lambda block: block,
     progress: Callable[[int, int, str], Any] | None = None,
     each: Callable[[Run], Any] | None = None,
+    **options: Any,
 ) -> Run:
-    """Drive a scene's robot along a path and read its sensors.
+    """Drive a scene's robot along a path and read its sensors; see `magtwin.twin.simulation.simulate`.
 
     b_total = b_map + b_disturbance with b_map at base_link's pose, and b_measured = b_total + b_model_error +
     b_noise. The disturbance depends on the kind of the magnetometer. A neural one takes what `disturbance_nt`
@@ -93,24 +75,16 @@ def simulate(
         anomaly_map: The map of `scene.map_layer`.
         rng: Source of all noise.
         speed: Forward speed on straight parts of the path [m/s].
-        duration_s: How long to drive [s]. Default: once along the path. A longer time means further laps of a
-            closed path, and back and forth on an open one.
-        rate_hz: Magnetometer readings a second, at t = k / rate_hz [Hz]. Default: the scene's.
-        obstacles: What the path must be clear of, and what stops the robot if it leaves its path.
-        controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`, or a custom controller.
         disturbance_nt: From a Run with all other sensors, the vector axes too, to the disturbance of each
             reading [nT], shape (N,), alone or with the standard deviation of its error. Called once, or for
             each block of a long run.
         model_error: Statistics of that error; None draws no error.
-        outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
-        lidar: Whether the LiDAR follows its schedule, or stays on or off.
-        engine: What moves the robot. Default: the kinematic engine. A Run is not moved anew.
-        sensors: Custom sensors whose columns the run has too: names of registered sensors, or factories; see
-            `magtwin.sim.extensions`.
-        interference: Custom terms that are added to the field at the magnetometer: names or functions.
+        sensors: Custom sensors: names or factories; see `magtwin.sim.extensions`.
+        interference: Custom terms of the field at the magnetometer: names or functions.
         complete: Called with the run, or with each block of a long one; returns it as it is to be kept.
         progress: Called with readings made, readings in all and the simulated time as text, in a long run.
         each: Called with each block of a long run, as `complete` gave it.
+        options: The fields of `Conditions` that have a default.
 
     Returns:
         A Run with every column of `COLUMNS`, in their order. `b_sd_nt` is nan and `flag_out_of_distribution`
@@ -120,74 +94,18 @@ def simulate(
         InputError: The path leaves the floor or touches an obstacle, an option is out of range, or nothing
             gives the disturbance. Nothing has been computed then.
     """
-    conditions = Conditions(
-        anomaly_map=anomaly_map,
-        obstacles=obstacles or Obstacles(),
-        network=disturbance_nt is not None,
-        duration_s=duration_s,
-        rate_hz=rate_hz,
-        controller=controller,
-        engine=engine or KINEMATIC,
-        lidar=lidar,
-        outside=outside,
-    )
+    conditions = Conditions(anomaly_map=anomaly_map, network=disturbance_nt is not None, **options)
     check_run(scene, path, conditions)
     draws = streams(rng)
     sensing = Sensing(scene, draws, conditions, sensors=sensors, interference=interference)
-    motion, metadata = travel(scene, path, draws, speed, conditions)
+    course = course_of(scene, path, speed, conditions)
+    (motion,) = drive([Trip(scene, course, draws)], conditions)
 
     def read(sensed: Sensed) -> Run:
         predicted = None if disturbance_nt is None else disturbance_nt(sensed.run)
         return complete(sensed.read(predicted, model_error))
 
-    return read_all(sensing, motion, metadata, read, progress=progress, each=each)
-
-
-def travel(
-    scene: Scene,
-    path: DriveInput,
-    draws: Mapping[str, np.random.Generator],
-    speed: float,
-    conditions: Conditions,
-) -> tuple[Travel, Metadata]:
-    """Drive the robot; returns what it did, and metadata on how. Arguments as for `simulate`."""
-    robot, duration_s, obstacles = scene.robot, conditions.duration_s, conditions.obstacles
-    controller, engine = conditions.controller, conditions.engine
-    if isinstance(path, Run):
-        kept = ("path", "controller", "speed_m_s")
-        metadata = {name: path.metadata[name] for name in kept if name in path.metadata}
-        return replayed(path, robot.drive), {**metadata, "engine": "replay"}
-    room: dict[str, Any] = {
-        "duration_s": duration_s,
-        "obstacles": obstacles,
-        "footprint_radius_m": robot.footprint_radius_m,
-        "wheel_errors": draw_wheel_errors(robot.drive, draws["drive"]),
-        "engine": engine,
-    }
-    metadata = {} if engine.name == "kinematic" else {"engine": engine.name}
-    if isinstance(path, Path):
-        name = controller if isinstance(controller, str) else type(controller).__name__
-        errors = draw_pose_error(robot.drive, draws["drive"])
-        motion = follow(path, robot.drive, speed=speed, controller=controller, pose_error=errors, **room)
-        return motion, {"path": path.name, "controller": name, "speed_m_s": float(speed), **metadata}
-    if isinstance(path, Commands):
-        motion = play(path.rows, robot.drive, start=scene.start, **room)
-        return motion, {"path": path.name, "controller": "commands", **metadata}
-    if not isinstance(path, str) or path != "random":
-        raise InputError(f'path must be a Path, Commands, a Run or "random", got {path!r}', parameter="path")
-    room["duration_s"] = RANDOM_S if duration_s is None else duration_s
-    driver = Driver(
-        robot.drive,
-        draws["driver"],
-        floor_m=scene.lab.floor_m,
-        obstacles=obstacles,
-        footprint_radius_m=robot.footprint_radius_m,
-        start=scene.start,
-        speed=speed,
-        duration_s=room["duration_s"],
-    )
-    motion = play([[0.0, 0.0, 0.0]], robot.drive, start=scene.start, controller=driver, **room)
-    return motion, {"path": "random", "controller": "driver", "speed_m_s": float(speed), **metadata}
+    return read_all(sensing, motion, course.metadata, read, progress=progress, each=each)
 
 
 def check_run(scene: Scene, path: DriveInput, conditions: Conditions) -> None:

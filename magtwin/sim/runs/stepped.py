@@ -7,8 +7,10 @@ rate. A robot depends only on its own commands and generator, not on the robots 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -21,10 +23,9 @@ from magtwin.run.run import Run
 from magtwin.sim.exact import ExactField, check_truth
 from magtwin.sim.interference import TORQUE_S, platforms_of_rows, rest_current_a, torques_nm
 from magtwin.sim.motion import loop
-from magtwin.sim.motion.closed_loop import LOOPS, ClosedLoop, fence_of
-from magtwin.sim.motion.controllers import guide_by_commands
+from magtwin.sim.motion.closed_loop import LOOPS, Robots
 from magtwin.sim.motion.drive import Moment, Pose, draw_wheel_errors, wheel_rates
-from magtwin.sim.motion.follow import CONTROL_RATE_HZ
+from magtwin.sim.motion.follow import CONTROL_RATE_HZ, STAND, loop_by_commands
 from magtwin.sim.plant import Plant
 from magtwin.sim.runs.sensing import streams, truth
 from magtwin.sim.runs.simulate import Predict
@@ -118,9 +119,8 @@ class SteppedRobots:
                 f"scene {scene.name!r} has a constant map and no Earth field, so the robot's plant has "
                 "nothing to add to; give the scene an Earth field"
             )
-        self._fence = fence_of(obstacles)
-        self._drive = _compiled_or_plain()
-        self._figures, self._state = np.zeros((count, loop.FIGURES)), np.zeros((count, loop.STATE))
+        self._code = _compiled()
+        self._moved = Robots([loop_by_commands(STAND, scene.robot.drive)] * count, obstacles)
         self._record = np.zeros((count, loop.RECORD, self._steps))
         self._t, self._angle, self._twist = np.zeros(count), np.zeros((count, 2)), np.zeros((count, 2))
         self._robots, self._lidar_s, self._offset = [scene.robot] * count, np.zeros(count), np.zeros(count)
@@ -173,18 +173,15 @@ class SteppedRobots:
         sessions = [self.scene.robot] * len(which) if robots is None else robots
         for i, pose, rng, robot in zip(which, poses, rngs, sessions, strict=True):
             draws = streams(rng)
-            start = ClosedLoop(
-                drive=robot.drive,
-                guide=guide_by_commands([[0.0, 0.0, 0.0]], robot.drive),
-                dt=1 / CONTROL_RATE_HZ,
-                pose0=pose,
-                steps=self._steps,
+            start = loop_by_commands(
+                STAND,
+                robot.drive,
+                start=pose,
                 footprint_radius_m=robot.footprint_radius_m,
                 wheel_errors=draw_wheel_errors(robot.drive, draws["drive"]),
             )
             start.check(self._obstacles)
-            self._figures[i], self._state[i] = start.figures(), start.state()
-            self._state[i, 8] = 0.0 if len(self._obstacles) else np.inf
+            self._moved.put(i, start)
             if self._model_error is not None:
                 self._offset[i] = self._model_error.in_session(draws["model_error"]).offset
             for name, sensor in self._sensors(robot, draws).items():
@@ -213,17 +210,9 @@ class SteppedRobots:
                 f"{twists.shape}, {np.count_nonzero(~np.isfinite(twists))} of them not finite"
             )
         rows = np.arange(self.count) if which is None else np.asarray(which, np.int64)
-        count = len(rows)
-        if not count:
+        if not len(rows):
             return
-        each, tables = np.arange(count, dtype=np.int64), np.zeros((loop.TABLE, count))
-        tables[1:3] = twists[rows].T
-        laws, made = np.full(count, loop.COMMANDS, np.int64), np.zeros(count, np.int64)
-        state, record = self._state[rows], np.zeros((count, loop.RECORD, self._steps))
-        state[:, 10] = 0.0
-        figures = self._figures[rows]
-        self._drive(laws, figures, tables, each, each + 1, *self._fence, state, 0, self._steps, record, made)
-        self._state[rows], self._record[rows] = state, record
+        self._record[rows], _ = self._moved.step(0, self._steps, rows, twists=twists[rows], code=self._code)
         self._t[rows] += self.step_s
         self._sense(rows, moved=True)
 
@@ -382,10 +371,8 @@ def _stacked_moments(moments: Sequence[Moment]) -> Moment:
 _PARTS = tuple(Moment.__dataclass_fields__)
 
 
-def _compiled_or_plain() -> Callable[..., None]:
-    """The loop for arrays, compiled if numba works; the bytes are the same."""
-    try:
-        robots: Callable[..., None] = LOOPS.open().robots
-    except ImportError:
-        robots = loop.robots
-    return robots
+def _compiled() -> ModuleType | None:
+    """The compiled loop; None for plain Python, where numba does not work. The bytes are the same."""
+    with suppress(ImportError):
+        return LOOPS.open()
+    return None

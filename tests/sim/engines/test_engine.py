@@ -20,8 +20,8 @@ from magtwin.sim.engines.replay import replayed
 from magtwin.sim.motion.commands import Commands, read_commands, write_commands
 from magtwin.sim.motion.controllers import guide_by_commands
 from magtwin.sim.motion.driver import Driver
-from magtwin.sim.motion.engine import Kinematic
-from magtwin.sim.motion.follow import follow, loop_along, play
+from magtwin.sim.motion.engine import KINEMATIC, Kinematic
+from magtwin.sim.motion.follow import STAND, follow, loop_along, loop_by_commands, play
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.twin import open_twin, simulate
@@ -200,15 +200,10 @@ def drive_about(seed, *, duration_s=300.0, obstacles, wheel_errors=(0.0, 0.0)):
         start=(0.0, 0.0, 0.0),
         duration_s=duration_s,
     )
-    return play(
-        [[0.0, 0.0, 0.0]],
-        DRIVE,
-        duration_s=duration_s,
-        controller=driver,
-        obstacles=obstacles,
-        footprint_radius_m=0.171,
-        wheel_errors=wheel_errors,
+    loop = loop_by_commands(
+        STAND, DRIVE, duration_s=duration_s, footprint_radius_m=0.171, wheel_errors=wheel_errors
     )
+    return KINEMATIC.drive(loop, driver, obstacles)
 
 
 ROOM = (box("desk", 1.5, 0.9, 0.4), box("chair", -1.2, -0.6, 0.2), box("cabinet", -2.7, 1.5, 0.25))
@@ -270,7 +265,7 @@ def test_run_drives_at_random_by_commands_and_by_replay(lab_scene, tmp_path, cap
     ("options", "what"),
     [
         (["--path", "sine", "--commands", "c.csv"], "--path and --commands"),
-        (["--path", "random", "--controller", "stanley"], "--controller stanley follows a path"),
+        (["--path", "random", "--controller", "release"], "--controller release follows a path"),
         (["--commands", "c.csv", "--speed", "0.1"], "--speed is for a path"),
         (["--engine", "newton", "--replay", "r.parquet"], "--engine newton cannot"),
     ],

@@ -71,41 +71,6 @@ def test_motors_that_lag_and_wheels_that_slip_do_not_take_it_off_its_path(name):
     assert_allclose([motion.v[-1], motion.w[-1]], 0.0, atol=0.02)  # means of the step in which it stops
 
 
-@pytest.mark.parametrize("name", PATHS)
-@pytest.mark.parametrize("controller", ["stanley", "pure_pursuit"])
-def test_stanley_and_pure_pursuit_drive_every_named_path_to_its_end(controller, name):
-    path, speed = path_named(name), 0.3
-    motion = follow(path, REAL, speed=speed, controller=controller)
-    # 0.016 m and 0.0042 m were seen, in the bends of fast_sine.
-    assert np.abs(cross_track(path, motion)).max() < 0.02
-    assert rms(cross_track(path, motion)) < RMS_M
-    assert np.hypot(*(motion.poses[-1, :2] - path.p_xy[-1])) < 0.005
-    assert motion.v.max() == pytest.approx(speed, rel=0.02)
-
-
-def test_stanley_steers_by_its_published_law():
-    # On a line, 0.05 m beside it, turned 0.1 rad away: w = v tan(-0.1 - atan(2.5 e / (0.1 + v))) / b.
-    path = Path("line", np.array([[0.0, 0.0], [3.0, 0.0]]))
-    guide = guide_along("stanley", path, DRIVE, speed=0.2, dt=0.02)
-    guide.node = 100
-    v, w = guide.command(0.0, 0.5, 0.03, 0.1, 0.2, 0.0)
-    beside = 0.03 + 0.06 * np.sin(0.1)  # of the steered wheel, 0.06 m ahead
-    assert v == pytest.approx(0.2)
-    assert w == pytest.approx(0.2 * np.tan(-0.1 - np.arctan(2.5 * beside / 0.3)) / 0.06, rel=1e-9)
-
-
-def test_pure_pursuit_drives_the_arc_through_its_goal():
-    path = Path("line", np.array([[0.0, 0.0], [3.0, 0.0]]))
-    guide = guide_along("pure_pursuit", path, DRIVE, speed=0.2, dt=0.02)
-    guide.node = 100
-    v, w = guide.command(0.0, 0.5, 0.03, 0.05, 0.2, 0.0)
-    goal = np.array([0.15, -0.03])
-    left = -np.sin(0.05) * goal[0] + np.cos(0.05) * goal[1]
-    assert w / v == pytest.approx(2 * left / (goal @ goal), rel=1e-9)
-    ahead = advance([0.5, 0.03, 0.05], v, w, np.linspace(0, 1, 2001))  # and that arc meets the goal
-    assert np.hypot(ahead[:, 0] - 0.65, ahead[:, 1]).min() < 1e-4
-
-
 def test_the_released_follower_pursues_the_points_as_published():
     path = Path("line", np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]))
     guide = guide_along("release", path, DRIVE, speed=0.1, dt=0.02)

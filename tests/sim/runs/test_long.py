@@ -185,6 +185,7 @@ def test_workers_of_a_sweep_write_their_long_runs_themselves(twin, tmp_path, lon
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_later_long_runs_of_a_process_take_no_memory_of_their_own():
     """Of ten runs of two hours at 1 Hz; in a process that has not made room before."""
     code = f"""

@@ -241,7 +241,6 @@ def test_one_robots_run_is_the_same_whichever_runs_are_wanted(passing):
         ({"ways": {}}, "no robot is to drive"),
         ({"ways": {"anne": EAST}}, "no robot 'anne'; did you mean 'ann'"),
         ({"ways": {"ann": line("out", (0, 0), (9, 0))}}, r"robot 'ann': path out"),
-        ({"wanted": ["cleo"]}, "no robot 'cleo'"),
         ({"meet": "bounce"}, "no way of robots to meet 'bounce'"),
     ],
 )
