@@ -68,9 +68,6 @@ def contradiction_nt(scene: Scene, anomaly_map: AnomalyMap) -> Contradiction:
 
     Returns:
         The difference. `agrees` is true up to `LEAST_NT`, or `PART` of the map's standard deviation.
-
-    Raises:
-        InputError: The scene has no Earth's field, or the map no valid node where a robot can stand.
     """
     p_xy, yaw = anomaly_map.grid.poses()
     read = anomaly_map.recorded_yaw
@@ -123,9 +120,6 @@ def check_agrees(scene: Scene, anomaly_map: AnomalyMap, where: str) -> Contradic
 
     Returns:
         The difference if it is small enough; None if there is nothing to contradict.
-
-    Raises:
-        InputError: They differ by more than `contradiction_nt` allows.
     """
     if scene.earth is None or not scene.magnets:
         return None

@@ -238,11 +238,7 @@ class ExactField:
 
 
 def check_truth(scene: Scene, anomaly_map: AnomalyMap) -> None:
-    """Refuse a physical magnetometer without a field: a constant map and no Earth's field.
-
-    Raises:
-        InputError: The scene is one of these.
-    """
+    """Refuse a physical magnetometer without a field: a constant map and no Earth's field."""
     physical = scene.robot.magnetometer.kind == "physical"
     if physical and ExactField(scene=scene, anomaly_map=anomaly_map).of == "none":
         raise InputError(
@@ -252,11 +248,7 @@ def check_truth(scene: Scene, anomaly_map: AnomalyMap) -> None:
 
 
 def check_field(scene: Scene, anomaly_map: AnomalyMap) -> None:
-    """Refuse a scene whose field is constant, because all places in it are alike to a magnetometer.
-
-    Raises:
-        InputError: The map is constant, and nothing on the stage is magnetised.
-    """
+    """Refuse a scene whose field is constant, because all places in it are alike to a magnetometer."""
     made = scene.magnets or scene.others  # other robots have iron too
     if not anomaly_map.is_constant or (scene.earth is not None and made):
         return
@@ -270,11 +262,7 @@ def check_field(scene: Scene, anomaly_map: AnomalyMap) -> None:
 
 
 def check_read(run: Run, anomaly_map: AnomalyMap) -> None:
-    """Refuse a run that was driven off the map, so that its readings are nan or constant.
-
-    Raises:
-        InputError: Every reading is nan, or all are the nearest value of a map that the robot never reached.
-    """
+    """Refuse a run that was driven off the map, so that its readings are nan or constant."""
     if not {"p_world_base", "b_map_nt", "b_total_nt"} <= set(run) or not run.rows:
         return
     mapped, p = run["b_map_nt"], run["p_world_base"][:, :2]

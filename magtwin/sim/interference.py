@@ -63,9 +63,6 @@ def ambient_field_nt(scene: Scene, p_world: ArrayLike) -> Array:
 
     Returns:
         Field in world axes [nT], shape (..., 3).
-
-    Raises:
-        InputError: The scene has no Earth's field, or a shape is wrong.
     """
     earth, bodies = _known(scene)
     p = np.asarray(p_world, float)
@@ -85,9 +82,6 @@ def level_field_nt(scene: Scene, p_xy: ArrayLike, height_m: float) -> tuple[Arra
 
     Returns:
         Field [nT], shape (N, 3), and dB/dx, dB/dy [nT/m], shape (N, 2, 3), in world axes.
-
-    Raises:
-        InputError: As for `ambient_field_nt`.
     """
     earth = _known_earth(scene)
     plane = _plane(scene.magnets, earth, float(height_m))
@@ -108,9 +102,6 @@ def level_gradient_nt_m(scene: Scene, p_xy: ArrayLike, height_m: float) -> Array
 
     Returns:
         Gradient [nT/m], shape (N,).
-
-    Raises:
-        InputError: As for `ambient_field_nt`.
     """
     total, slopes = level_field_nt(scene, p_xy, height_m)
     (xx, xy, xz), (yx, yy, yz) = np.moveaxis(slopes, 0, -1)
@@ -130,9 +121,6 @@ def ambient_gradient_nt_m(scene: Scene, p_world: ArrayLike) -> Array:
 
     Returns:
         Gradient [nT/m], shape (...).
-
-    Raises:
-        InputError: As for `ambient_field_nt`.
     """
     earth, bodies = _known(scene)
     p = np.asarray(p_world, float)
@@ -242,9 +230,6 @@ def turning_iron_nt(robot: RobotSpec, wheel_angle: ArrayLike) -> Array:
 
     Returns:
         Field in base_link axes [nT], shape (N, 3).
-
-    Raises:
-        InputError: The magnetometer is in the middle of a wheel or of the caster.
     """
     platform, angle = robot.platform, np.asarray(wheel_angle, float)
     rolled = (angle[:, 0] + angle[:, 1]) * (robot.drive.wheel_radius_m / platform.caster_radius_m / 2)

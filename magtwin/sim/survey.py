@@ -80,9 +80,6 @@ def survey_readings(
 
     Returns:
         A row for each node, in the order of `Grid.poses`, with magnitudes; `good` where the robot can stand.
-
-    Raises:
-        InputError: The Earth's field is unknown, the grid has no cell, or a figure is out of range.
     """
     about: dict[str, Any] = {"source": source, "licence": licence, "created": created}
     about |= {"blocked": blocked, "jobs": jobs}
@@ -215,9 +212,6 @@ def survey(
 
     Returns:
         The map, with its variance. Nodes that are blocked or where lock was lost are not valid.
-
-    Raises:
-        InputError: As for `survey_readings`.
     """
     errors: dict[str, Any] = {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}
     read, lost = _visit(scene, rng, readings=readings, **errors, **options)
@@ -397,9 +391,6 @@ def survey_room(
 
     Returns:
         The map, and the number of filled nodes.
-
-    Raises:
-        InputError: As for `survey`, or a heading has no reading at all.
     """
     field = survey(
         scene,

@@ -28,10 +28,6 @@ def replayed(run: Run, drive: DriveSpec) -> SampledMotion:
 
     Returns:
         The motion, one mean interval longer than the rows, so that it gives as many readings.
-
-    Raises:
-        InputError: A column is missing, there are fewer than two rows, times do not ascend, or a pose is not
-            finite; the text has the row.
     """
     lacking = [name for name in ("t", "p_world_base") if name not in run]
     if "yaw" not in run and "q_world_base_xyzw" not in run:

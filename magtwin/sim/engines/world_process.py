@@ -69,11 +69,7 @@ class WorldProcess:
         self._held.close()
 
     def seen(self) -> list[float]:
-        """The next answer.
-
-        Raises:
-            InputError: The process ended, or took longer than its limit.
-        """
+        """The next answer."""
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:

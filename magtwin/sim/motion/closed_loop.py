@@ -45,9 +45,6 @@ def warm_up() -> None:
     """Open the compiled loop and the compiled look-ups of fields, as pays before long jobs.
 
     This takes about a second if the machine code is cached, else a few. The bytes of a run stay the same.
-
-    Raises:
-        ImportError: numba does not work here. The loop stays in plain Python then.
     """
     LOOPS.open()
     lookup.warm_up()
@@ -129,9 +126,6 @@ def run_loops(loops: Sequence[ClosedLoop], obstacles: Obstacles | None = None) -
 
     Returns:
         The motion of each, until its controller was done and it stood, or its steps were over.
-
-    Raises:
-        InputError: A robot would begin in an obstacle, or the lengths of steps differ.
     """
     obstacles = obstacles or Obstacles()
     starts = {(c.pose0, c.footprint_radius_m, c.dt, c.drive.command_timeout_s): c for c in loops}
@@ -304,11 +298,7 @@ class Chassis:
     """A robot that is commanded step by step: by a custom controller, a keyboard, or a learner."""
 
     def __init__(self, closed_loop: ClosedLoop, obstacles: Obstacles | None = None) -> None:
-        """Put a robot at its start; the guide is not used.
-
-        Raises:
-            InputError: It would begin in an obstacle.
-        """
+        """Put a robot at its start; the guide is not used."""
         obstacles = obstacles or Obstacles()
         closed_loop.check(obstacles)
         self._course = closed_loop
@@ -346,9 +336,6 @@ class Chassis:
 
         Returns:
             The record of the step, shape (loop.RECORD,).
-
-        Raises:
-            InputError: The command is not finite.
         """
         if command is None:
             self._age_s += self._course.dt

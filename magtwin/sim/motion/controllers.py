@@ -142,10 +142,6 @@ def guide_along(name: str, path: Path, drive: DriveSpec, *, speed: float, dt: fl
         drive: Its limits, and the lag of its motors, which "follower" compensates.
         speed: Wanted forward speed [m/s].
         dt: Time between commands [s].
-
-    Raises:
-        UnknownNameError: No such controller; the text names the nearest one.
-        InputError: `speed` is out of range, or the path is too small.
     """
     law = find("controller", name, CONTROLLERS)
     pieces = plan(drivable(path), drive, speed=speed)
@@ -186,9 +182,6 @@ def guide_by_commands(commands: ArrayLike, drive: DriveSpec) -> Guide:
     Args:
         commands: Time since the start [s], forward speed [m/s] and yaw rate [rad/s] of each, shape (K, 3).
         drive: Its command_timeout_s ends a command.
-
-    Raises:
-        InputError: They have another shape, are not finite, or not in order of time; the text gives the row.
     """
     rows = np.asarray(commands, float)
     if rows.ndim != 2 or rows.shape[1] != 3 or not len(rows):

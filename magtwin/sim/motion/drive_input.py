@@ -24,9 +24,6 @@ def drive_input(path: Any, room: Room | None = None, *, fit: bool = False) -> Dr
         room: Where it is driven: named paths are scaled to its floor, see `magtwin.path.path_in`.
             Default: the floor for which they were designed.
         fit: Whether a path that does not fit into the room is moved and shrunk until it does.
-
-    Raises:
-        InputError: There is no such path, no room for it, or it cannot be driven.
     """
     if isinstance(path, Commands | Run) or (isinstance(path, str) and path == "random"):
         return path

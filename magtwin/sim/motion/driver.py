@@ -79,9 +79,6 @@ class Driver:
             start: Pose of the robot.
             speed: Mean forward speed [m/s].
             duration_s: How long to drive [s].
-
-        Raises:
-            InputError: `speed` is out of range, or there is no room at the start.
         """
         if not 0 < speed <= drive.v_max:
             raise InputError(

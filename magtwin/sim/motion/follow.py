@@ -60,9 +60,6 @@ def loop_along(
         footprint_radius_m: Radius of the circle that they stop [m].
         wheel_errors: Relative errors of the wheels' radius and separation.
         pose_error: Error of the pose that the controller gets. Default: it gets the exact pose.
-
-    Raises:
-        InputError: `speed`, `duration_s` or `rate_hz` is out of range, or the path touches an obstacle.
     """
     dt = _step(rate_hz, drive)
     check_speed(speed, drive)
@@ -178,10 +175,6 @@ def loop_by_commands(
         rate_hz: As for `loop_along`.
         footprint_radius_m: As for `loop_along`.
         wheel_errors: As for `loop_along`.
-
-    Raises:
-        InputError: Commands are not finite or not in order of time, or `duration_s` or `rate_hz` is out of
-            range.
     """
     dt = _step(rate_hz, drive)
     guide = guide_by_commands(commands, drive)

@@ -100,10 +100,6 @@ def plan(path: Path, drive: DriveSpec, *, speed: float) -> list[Piece]:
         path: Where to drive, as an open line.
         drive: Limits.
         speed: Wanted forward speed [m/s].
-
-    Raises:
-        InputError: `speed` is not above 0 or is more than the drive allows, or the path turns more tightly
-            than a robot that steers like a car can.
     """
     check_speed(speed, drive)
     if drive.turning_radius_m:
@@ -191,9 +187,6 @@ def drivable(path: Path) -> Path:
 
     Its first and last points stay. A robot that was recorded at rest leaves a knot of points that no robot
     can follow.
-
-    Raises:
-        InputError: The whole path lies within 5 mm.
     """
     if np.diff(path.s).min() >= _JITTER_M:
         return path

@@ -99,10 +99,6 @@ class Runs(Summarized, Sequence[Run]):
             finish: Makes whole runs of sensed ones.
             columns: Columns to keep beside t. Default: all.
             block: Runs made at a time.
-
-        Raises:
-            InputError: There is no job, a column or `block` is wrong, or `simulate` would refuse a job; the
-                text then has its number.
         """
         if not jobs:
             raise InputError("no runs are asked for; give a seed for each")

@@ -56,11 +56,7 @@ class Trip:
 
 
 def course_of(scene: Scene, path: DriveInput, speed: float, conditions: Conditions) -> Course:
-    """Plan what a robot is to drive; arguments as for `magtwin.sim.runs.simulate.simulate`.
-
-    Raises:
-        InputError: The path touches an obstacle or cannot be driven at that speed.
-    """
+    """Plan what a robot is to drive; arguments as for `magtwin.sim.runs.simulate.simulate`."""
     robot, named = scene.robot, conditions.controller
     if isinstance(path, Run):
         kept = ("path", "controller", "speed_m_s")
@@ -93,11 +89,7 @@ def course_of(scene: Scene, path: DriveInput, speed: float, conditions: Conditio
 
 
 def drive(trips: Sequence[Trip], conditions: Conditions) -> list[Travel]:
-    """Drive robots, each as if it were alone.
-
-    Raises:
-        InputError: The end of a path was not reached, or a controller or engine cannot drive.
-    """
+    """Drive robots, each as if it were alone."""
     loops: dict[int, ClosedLoop] = {}
     travels: dict[int, Travel] = {}
     for n, trip in enumerate(trips):

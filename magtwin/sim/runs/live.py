@@ -108,9 +108,6 @@ class LiveRobot:
             model_error: Statistics of the error of these predictions; None draws no error.
             outside: What the map reads outside its extent.
             lidar: Whether the LiDAR follows its schedule, or stays on or off.
-
-        Raises:
-            InputError: It would begin in an obstacle, or an option is out of range.
         """
         robot, obstacles = scene.robot, obstacles or Obstacles()
         conditions = Conditions(
@@ -170,9 +167,6 @@ class LiveRobot:
 
         Returns:
             The readings in the step's time, every column of `COLUMNS`; there may be none.
-
-        Raises:
-            InputError: The command is not finite.
         """
         self.drive(command)
         return self.read()

@@ -64,9 +64,6 @@ def simulate_robots(
     Returns:
         A Run for each wanted robot, by name. Its metadata name the robot, and the robot that came nearest,
         with clearance [m] and time [s].
-
-    Raises:
-        InputError: Robots would meet, or `simulate` would refuse one; the text names it.
     """
     if not paths:
         raise InputError("no robot is to drive; name one at least", parameter="paths")

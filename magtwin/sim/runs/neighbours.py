@@ -85,9 +85,6 @@ def iron_moments(robot: RobotSpec, b_base_nt: ArrayLike) -> Array:
 
     Returns:
         Moments in base_link axes [A m2], shape (N, 3).
-
-    Raises:
-        InputError: Its magnetometer is at base_link's origin, so the moment is unknown.
     """
     platform, b = robot.platform, np.asarray(b_base_nt, float)
     iron = np.einsum("nk,jk->nj", b, np.reshape(platform.soft_iron, (3, 3))) + platform.hard_iron_nt

@@ -246,9 +246,6 @@ class Sensing:
             predicted: What a network predicts; None for a magnetometer without one.
             model_error: Statistics of the error of the prediction. None draws no error, and so does a
                 prediction without a standard deviation.
-
-        Raises:
-            InputError: The prediction has not one number for each reading.
         """
         columns, spec = dict(columns), self.scene.robot.magnetometer
         rows = len(columns["t"])

@@ -89,10 +89,6 @@ def simulate(
     Returns:
         A Run with every column of `COLUMNS`, in their order. `b_sd_nt` is nan and `flag_out_of_distribution`
         is false, because both depend on the network.
-
-    Raises:
-        InputError: The path leaves the floor or touches an obstacle, an option is out of range, or nothing
-            gives the disturbance. Nothing has been computed then.
     """
     conditions = Conditions(anomaly_map=anomaly_map, network=disturbance_nt is not None, **options)
     check_run(scene, path, conditions)
@@ -109,11 +105,7 @@ def simulate(
 
 
 def check_run(scene: Scene, path: DriveInput, conditions: Conditions) -> None:
-    """Check the arguments of `simulate`.
-
-    Raises:
-        InputError: The path leaves the floor, an option is out of range, or nothing gives the disturbance.
-    """
+    """Check the arguments of `simulate`."""
     robot = scene.robot
     rate = robot.magnetometer.rate_hz if conditions.rate_hz is None else conditions.rate_hz
     if not 0 < rate < math.inf:

@@ -91,9 +91,6 @@ class SteppedRobots:
                 deviation of its error.
             model_error: Statistics of that error, drawn for each robot each time that it begins; None draws
                 no error.
-
-        Raises:
-            InputError: `count` or `step_s` is out of range, or nothing gives the disturbance.
         """
         kind, timeout = scene.robot.magnetometer.kind, scene.robot.drive.command_timeout_s
         if not isinstance(count, int) or count < 1:
@@ -166,9 +163,6 @@ class SteppedRobots:
             rngs: Source of all noise of each until it begins again.
             robots: The scene's robot in the session of each, as `magtwin.sim.session.draw_session` gives it.
                 Default: the scene's robot.
-
-        Raises:
-            InputError: A robot would begin in an obstacle.
         """
         sessions = [self.scene.robot] * len(which) if robots is None else robots
         for i, pose, rng, robot in zip(which, poses, rngs, sessions, strict=True):
@@ -199,9 +193,6 @@ class SteppedRobots:
         Args:
             commands: Forward speed [m/s] and yaw rate [rad/s] of each, shape (count, 2).
             which: Numbers of the robots. Default: all. The others stay as they are.
-
-        Raises:
-            InputError: A command is not finite, or they are not of that shape.
         """
         twists = np.asarray(commands, float)
         if twists.shape != (self.count, 2) or not np.isfinite(twists).all():

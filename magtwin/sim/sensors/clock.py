@@ -63,11 +63,7 @@ class SampleClock:
         self._fresh: list[Samples] = []
 
     def due(self, until_s: float) -> Array:
-        """Times of the samples before `until_s` that have not been taken yet [s], shape (M,).
-
-        Raises:
-            InputError: There are more than memory can hold.
-        """
+        """Times of the samples before `until_s` that have not been taken yet [s], shape (M,)."""
         check_count("samples of a sensor", until_s - self._next / self.rate_hz, self.rate_hz)
         last = math.ceil(until_s * self.rate_hz - _TOLERANCE)
         stamps = np.arange(self._next, max(last, self._next)) / self.rate_hz

@@ -37,9 +37,6 @@ def lidar_on(
         spec: The schedule: off for off_s, on for on_s, and so on; at t = 0 it is at phase_s.
         t: Times since the start [s].
         mode: "schedule", or always "on" or "off".
-
-    Raises:
-        InputError: `mode` is another word.
     """
     t = np.asarray(t, float)
     if mode == "schedule":
@@ -191,9 +188,6 @@ def scans_of(run: Run, robot: RobotSpec, obstacles: Obstacles, rng: np.random.Ge
         robot: Its LiDAR, and where it is mounted.
         obstacles: What there is to see.
         rng: Source of delays and noise.
-
-    Raises:
-        InputError: There are more scans than memory can hold.
     """
     t, base, yaw = run["t"], run["p_world_base"], np.unwrap(run["yaw"])
     check_count("a LiDAR's scans", t[-1] - t[0], robot.lidar.scan_rate_hz)
@@ -242,10 +236,6 @@ def _cast(segments: Array, rays: int) -> Array:
     """Range to the first segment along each ray from the origin, inf if there is none, shape (rays,).
 
     A segment is met by the rays between the directions to its ends.
-
-    Args:
-        segments: Their ends [m], shape (C, 2, 2).
-        rays: Number of rays, see `ray_angles`.
     """
     a, b = segments[:, 0], segments[:, 1]
     cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -74,9 +74,6 @@ class Dropouts:
 
         Args:
             stamps: Their times [s], shape (N,).
-
-        Raises:
-            InputError: There are more dropouts than memory can hold.
         """
         stamps = np.asarray(stamps, float)
         if not all(self._means_s) or not len(stamps):
