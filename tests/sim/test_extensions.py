@@ -74,15 +74,6 @@ def test_an_interference_term_is_added_to_the_field_at_the_sensor(twin):
     assert_allclose(run["b_total_nt"], run["b_truth_nt"])
 
 
-def test_interference_is_added_to_what_a_network_predicts(twin):
-    def none(run):
-        return np.zeros(run.rows)
-
-    off = run_of(twin, interference=[pump_nt], disturbance_nt=none)["b_disturbance_nt"]
-    assert np.ptp(off) > 100
-    assert np.abs(off).max() < 301
-
-
 def test_a_registered_controller_drives_by_its_name(twin):
     run = run_of(twin, controller="test_straight_on")
     assert run.metadata["controller"] == "test_straight_on"

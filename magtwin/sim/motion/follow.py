@@ -36,8 +36,6 @@ def loop_along(
     *,
     speed: float,
     duration_s: float | None = None,
-    start: Pose | None = None,
-    rate_hz: float = CONTROL_RATE_HZ,
     controller: str = "follower",
     obstacles: Obstacles | None = None,
     footprint_radius_m: float = 0.0,
@@ -52,16 +50,13 @@ def loop_along(
         speed: Wanted forward speed [m/s].
         duration_s: How long to drive [s]: further laps of a closed path, back and forth on an open one.
             Default: to the end of the path, or one lap, and stop there.
-        start: First x [m], y [m], yaw [rad] in world, from where the robot drives straight to the path's
-            first point. Default: on that point, along the path.
-        rate_hz: Control steps a second [Hz].
         controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`.
         obstacles: What the path must be clear of.
         footprint_radius_m: Radius of the circle that they stop [m].
         wheel_errors: Relative errors of the wheels' radius and separation.
         pose_error: Error of the pose that the controller gets. Default: it gets the exact pose.
     """
-    dt = _step(rate_hz, drive)
+    dt = 1.0 / CONTROL_RATE_HZ
     check_speed(speed, drive)
     if duration_s is not None:
         _check_duration(duration_s)
@@ -70,10 +65,6 @@ def loop_along(
     line = path if controller == "release" else drivable(path)
     if duration_s is not None:
         line = line.prolonged(speed * duration_s)
-    if start is not None:
-        line = Path(line.name, np.vstack([start[:2], line.p_xy]))
-        if obstacles is not None and math.dist(*line.p_xy[:2]) > 0:
-            check_clear(Path(f"{path.name}, from its start", line.p_xy[:2]), obstacles, footprint_radius_m)
     if duration_s is None and line.length > speed * LONGEST_S > 0:
         raise InputError(
             f"path {path.name}: its {line.length:.4g} m take {line.length / speed:.3g} s at {speed:g} m/s, "
@@ -97,7 +88,7 @@ def loop_along(
         drive=drive,
         guide=guide,
         dt=dt,
-        pose0=guide.pose0 if start is None else start,
+        pose0=guide.pose0,
         steps=max(math.ceil(duration_s / dt - 1e-9), 1),
         least_steps=int(least_s / dt),
         footprint_radius_m=footprint_radius_m,
@@ -159,7 +150,6 @@ def loop_by_commands(
     *,
     start: Pose = (0.0, 0.0, 0.0),
     duration_s: float | None = None,
-    rate_hz: float = CONTROL_RATE_HZ,
     footprint_radius_m: float = 0.0,
     wheel_errors: tuple[float, float] = (0.0, 0.0),
 ) -> ClosedLoop:
@@ -172,11 +162,10 @@ def loop_by_commands(
         drive: As for `loop_along`.
         start: First x [m], y [m], yaw [rad] in world.
         duration_s: How long to drive [s]. Default: until the last command is void and the robot stands.
-        rate_hz: As for `loop_along`.
         footprint_radius_m: As for `loop_along`.
         wheel_errors: As for `loop_along`.
     """
-    dt = _step(rate_hz, drive)
+    dt = 1.0 / CONTROL_RATE_HZ
     guide = guide_by_commands(commands, drive)
     if duration_s is None:
         at_rest = 1 + drive.v_max / drive.a_max + drive.w_max / drive.alpha_max + 20 * drive.motor_lag_s
@@ -192,19 +181,6 @@ def loop_by_commands(
         footprint_radius_m=footprint_radius_m,
         wheel_errors=wheel_errors,
     )
-
-
-def _step(rate_hz: float, drive: DriveSpec) -> float:
-    """Length of a control step [s]."""
-    if not 0 < rate_hz < math.inf:
-        raise InputError(f"rate_hz of a controller must be above 0 Hz and finite, got {rate_hz!r}")
-    if rate_hz * drive.command_timeout_s <= 1:
-        raise InputError(
-            f"rate_hz of a controller must be above {1 / drive.command_timeout_s:g} Hz, or the drive would "
-            f"stop between commands by its command_timeout_s, {drive.command_timeout_s:g} s; got "
-            f"{rate_hz!r}: raise either"
-        )
-    return 1.0 / rate_hz
 
 
 def _check_duration(duration_s: float) -> None:

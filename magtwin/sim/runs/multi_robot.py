@@ -40,26 +40,13 @@ def simulate_robots(
     each: Callable[[str, Run], Any] | None = None,
     **options: Any,
 ) -> dict[str, Run]:
-    """Drive robots of a scene at the same time, each with the kinematic engine.
+    """Drive robots of a scene at the same time, each with the kinematic engine; see `magtwin.twin.robots`.
 
     A robot's Run is that of `simulate` in `scene.led_by(name)` with the same generator, except for the
-    field of the others at its magnetometer, and the bumps.
-
-    Args:
-        scene: Lab and robots.
-        paths: What each robot drives, by its name, as for `simulate`. Robots without a path are absent.
-        anomaly_map: The map of `scene.map_layer`.
-        rngs: Source of all noise of each robot, by name.
-        wanted: Names of the robots whose sensors are read. Default: all. The others drive nevertheless.
-        meet: What happens if footprints overlap: a refusal with time and place, or flag_bump in both Runs
-            while it lasts; they drive through each other.
-        speed: As for `simulate`, of each.
-        disturbances_nt: What predicts the disturbance of each robot with a neural magnetometer, by name.
-        model_errors: Statistics of the errors of these predictions, by name; None draws no error.
-        complete: As for `simulate`, called with the robot's name and its run, or each block of a long one.
-        progress: As for `simulate`, of each run in turn.
-        each: As for `simulate`, called with the robot's name and each block of its run, if that is long.
-        options: As for `simulate`.
+    field of the others at its magnetometer, and the bumps. Arguments are those of `simulate`, by the robot's
+    name where robots differ. `paths` is what each drives: robots without a path are absent. `wanted` names
+    those whose sensors are read; the others drive nevertheless. `meet` is what happens if footprints overlap:
+    "refuse" names time and place, "flag" sets flag_bump in both Runs while they drive through each other.
 
     Returns:
         A Run for each wanted robot, by name. Its metadata name the robot, and the robot that came nearest,

@@ -145,7 +145,7 @@ class Sensing:
         self._exact = ExactField(scene=scene, anomaly_map=self._map, outside=self._outside)
         self._physical = not network and spec.kind == "physical"
         self._neighbours, self._near = neighbours, neighbours if scene.earth is not None else ()
-        self._plant = None if robot.plant == PlantSpec() else Plant(robot.plant, draws["interference"])
+        self._plant = None if robot.plant == PlantSpec() else Plant(robot.plant)
         added = bool(self._near or terms or self._plant)
         if (terms or self._plant) and self._exact.of == "none":
             what = "interference" if terms else "the robot's plant"

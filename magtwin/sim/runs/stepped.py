@@ -21,12 +21,11 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import into_base
 from magtwin.run.run import Run
 from magtwin.sim.exact import ExactField, check_truth
-from magtwin.sim.interference import TORQUE_S, platforms_of_rows, rest_current_a, torques_nm
+from magtwin.sim.interference import TORQUE_S, platforms_of_rows
 from magtwin.sim.motion import loop
 from magtwin.sim.motion.closed_loop import LOOPS, Robots
 from magtwin.sim.motion.drive import Moment, Pose, draw_wheel_errors, wheel_rates
 from magtwin.sim.motion.follow import CONTROL_RATE_HZ, STAND, loop_by_commands
-from magtwin.sim.plant import Plant
 from magtwin.sim.runs.sensing import streams, truth
 from magtwin.sim.runs.simulate import Predict
 from magtwin.sim.sensors.battery import Battery, wheels_energy_j
@@ -110,11 +109,9 @@ class SteppedRobots:
         self._map, self._obstacles, self._disturbance_nt = anomaly_map, obstacles, disturbance_nt
         self._exact = ExactField(scene=scene, anomaly_map=anomaly_map, outside="clamp")
         self._model_error = model_error
-        self._planted = scene.robot.plant != PlantSpec()
-        if self._planted and self._exact.of == "none":
+        if scene.robot.plant != PlantSpec():
             raise InputError(
-                f"scene {scene.name!r} has a constant map and no Earth field, so the robot's plant has "
-                "nothing to add to; give the scene an Earth field"
+                f"robot {scene.robot.name!r} has a plant, which only runs simulate; leave it out"
             )
         self._code = _compiled()
         self._moved = Robots([loop_by_commands(STAND, scene.robot.drive)] * count, obstacles)
@@ -131,9 +128,7 @@ class SteppedRobots:
         """The sensors of a robot that begins."""
         rate, spec = 1 / self.step_s, replace(robot.magnetometer, flicker_corner_hz=0.0)
         time_s = self._model_error.time_s if self._model_error else 0.0
-        plant = {"plant": Plant(robot.plant, draws["interference"])} if self._planted else {}
         return {
-            **plant,
             "odometry": Odometry(robot.drive, draws["odometry"], rate_hz=rate),
             "imu": Imu(robot.imu, robot.q_base_imu_xyzw, draws["imu"], rate_hz=rate),
             "battery": Battery(
@@ -284,12 +279,8 @@ class SteppedRobots:
             if self._model_error is not None:
                 process = sensed["error"].next(1)[0]
                 error = self._model_error.error_nt(sd, process, self._offset[which])
-            if self._planted:
-                plain, whole = self._exact_nt(which, now, table, supply_a, b_map, sensed)
-                disturbance = disturbance + np.nan_to_num(_sizes(whole) - _sizes(plain))
         elif spec.kind == "physical":
-            _, field = self._exact_nt(which, now, table, supply_a, b_map, sensed)
-            disturbance = _sizes(field) - b_map
+            disturbance = _sizes(self._exact_nt(which, now, table, supply_a, b_map)) - b_map
             disturbance = np.nan_to_num(disturbance)  # a map of one heading is read beside b_map's place
         else:
             disturbance = np.zeros(len(which))
@@ -303,41 +294,19 @@ class SteppedRobots:
         }
 
     def _exact_nt(
-        self,
-        which: NDArray[np.intp],
-        now: Moment,
-        table: Columns,
-        supply_a: Array,
-        b_map: Array,
-        sensed: dict[str, Any],
-    ) -> tuple[Array, Array]:
-        """The exact field without the plant and with it in base_link axes [nT], shape (N, 3) each."""
-        scene, ambient = self._scene_of(which), None
+        self, which: NDArray[np.intp], now: Moment, table: Columns, supply_a: Array, b_map: Array
+    ) -> Array:
+        """The exact field in base_link axes [nT], shape (N, 3)."""
         past = _Past(self._moment(which, max(self._steps - 1 - round(TORQUE_S * CONTROL_RATE_HZ), 0)))
-        t = np.maximum(self._t[which], TORQUE_S)  # rows are robots, so times are in no order
-        if self._planted:
-            ambient = self._exact.ambient_nt(scene, now, b_map)
-        field = self._exact.at_sensor_nt(
-            scene,
+        return self._exact.at_sensor_nt(
+            self._scene_of(which),
             past,
-            t,
+            np.maximum(self._t[which], TORQUE_S),  # rows are robots, so times are in no order
             true=now,
             lidar_on=table["lidar_on"],
             supply_a=supply_a,
             at_rest_nt=b_map,
-            ambient=ambient,
         )
-        if ambient is None:
-            return field, field
-        added = sensed["plant"].field_nt(
-            self._t[which][None],
-            ambient[0][None],
-            torques_nm=torques_nm(scene.robot, past, t, now)[None],
-            speed=now.v[None],
-            lidar_on=table["lidar_on"][None],
-            supply_a=supply_a[None] - rest_current_a(scene.robot.battery),
-        )
-        return field, field + added[0]
 
     def _scene_of(self, which: NDArray[np.intp]) -> Scene:
         """The scene with the platforms of some robots in their sessions, a row each."""

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from magtwin.errors import InputError
-from magtwin.sim.motion.drive import Motion, advance, integrate_twist, limiter, wheel_rates
+from magtwin.sim.motion.drive import Motion, integrate_twist, limiter, wheel_rates
 from magtwin.spec.drive import DriveSpec
 
 DRIVE = DriveSpec()
@@ -22,19 +22,6 @@ def test_a_constant_twist_goes_round_a_circle_of_radius_v_over_w_whatever_the_st
         poses = integrate_twist([v] * steps, [w] * steps, 2 * np.pi / w / steps)
         assert_allclose(np.hypot(poses[:, 0], poses[:, 1] - v / w), v / w, rtol=1e-12)
         assert_allclose(poses[-1], [0, 0, 2 * np.pi], atol=1e-12)
-
-
-@given(v=speeds, w=turns)
-def test_driving_there_and_back_ends_at_the_start(v, w):
-    assert_allclose(integrate_twist([v, -v], [w, -w], dt=0.1)[-1], 0, atol=1e-12)
-
-
-@given(v=speeds, w=turns, parts=st.integers(1, 9))
-def test_a_step_in_parts_is_the_step(v, w, parts):
-    pose = whole = np.array([0.3, -0.2, 1.0])
-    for _ in range(parts):
-        pose = advance(pose, v, w, 1.0 / parts)
-    assert_allclose(pose, advance(whole, v, w, 1.0), atol=1e-12)
 
 
 @given(v=speeds, w=turns)
@@ -66,13 +53,6 @@ def test_a_motion_stands_still_after_its_last_step():
     late = motion.at([0.2, 5.0])
     assert_allclose(late.pose, motion.poses[[-1, -1]], atol=1e-15)
     assert_allclose([late.v, late.w, late.a], 0)
-
-
-def test_acceleration_sums_up_to_speed():
-    v = np.array([0.01, 0.02, 0.02, 0.0])
-    motion = Motion(DRIVE, 0.02, v, np.zeros(4))
-    a = motion.at(np.arange(4) * 0.02 + 0.01).a
-    assert_allclose(np.cumsum(a) * 0.02, v, atol=1e-15)
 
 
 @given(
@@ -119,20 +99,6 @@ def test_a_motion_refuses_twists_that_are_not_finite_or_do_not_match():
         Motion(DRIVE, 0.02, np.zeros(2), np.zeros(2), wheel_v=np.zeros(3))
     with pytest.raises(InputError, match=r"poses of a Motion must have shape \(3, 3\), got \(2, 3\)"):
         Motion(DRIVE, 0.02, np.zeros(2), np.zeros(2), poses=np.zeros((2, 3)))
-
-
-def test_an_ideal_motion_was_commanded_as_it_went_and_touched_nothing():
-    motion = Motion(DRIVE, 0.02, np.array([0.1, 0.2]), np.array([0.0, 0.5]))
-    seen = motion.at([0.0, 0.03, 9.0])
-    assert_allclose(seen.v_cmd, [0.1, 0.2, 0.0])
-    assert_allclose(seen.w_cmd, [0.0, 0.5, 0.0])
-    assert not seen.bump.any()
-
-
-def test_wheels_that_slip_turn_more_than_the_robot_goes():
-    motion = Motion(DRIVE, 0.02, np.full(9, 0.2), np.zeros(9), wheel_v=np.full(9, 0.25))
-    assert_allclose(motion.at([0.1]).wheel_angle, [[0.25 * 0.1 / 0.03575] * 2], rtol=1e-12)
-    assert_allclose(motion.at([0.1]).pose, [[0.02, 0.0, 0.0]], atol=1e-12)
 
 
 @pytest.mark.parametrize(

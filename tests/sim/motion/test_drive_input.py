@@ -10,12 +10,11 @@ import pytest
 from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
 from magtwin.files.file import shipped
-from magtwin.io.formats import read_run, write_run
-from magtwin.path import Path, path_named, path_of_points, read_path_csv
+from magtwin.path import Path, path_named
 from magtwin.run.run import Run
 from magtwin.sim.motion.commands import Commands
 from magtwin.sim.motion.drive_input import drive_input, drive_inputs
-from magtwin.twin import open_twin, scan, scene_from_toml, simulate, simulate_robots, sweep
+from magtwin.twin import open_twin, scene_from_toml, simulate, simulate_robots, sweep
 from magtwin.usd.scene import read_scene
 
 POINTS = [[-1.0, -0.5], [0.25, 0.5], [1.0, 0.125], [0.5, -0.75]]
@@ -60,18 +59,6 @@ def test_a_scene_that_no_file_holds_runs_as_its_stage_does(tmp_path):
     assert same(many[0], next(iter(sweep(file, commands, [0], **physical))))
 
 
-def test_every_writer_and_the_lidar_take_the_twin_of_a_scene(lab_scene, tmp_path):
-    scene = read_scene(lab_scene)
-    twin = open_twin(scene)
-    run = simulate(twin, "figure8", lidar="on", **SHORT)
-    assert np.array_equal(scan(scene, run).ranges_m, scan(lab_scene, run).ranges_m)
-    for suffix in (".parquet", ".rrd", ".mcap", ".npz"):
-        write_run(run, tmp_path / f"run{suffix}", twin)
-        assert np.array_equal(read_run(tmp_path / f"run{suffix}")["t"], run["t"])
-    with pytest.raises(InputError, match=r"run\.usda: USD names the scene's file, and this scene has none"):
-        write_run(run, tmp_path / "run.usda", twin)
-
-
 def test_the_stage_of_a_scene_lasts_as_long_as_its_twins(lab_scene):
     twin = open_twin(read_scene(lab_scene))
     file, other = twin.scene_file, replace(twin, metadata={})
@@ -101,14 +88,6 @@ def test_points_give_the_run_of_their_csv(twin, tmp_path):
     assert same(mixed[1], read)
     name = twin.scene.robot.name
     assert same(simulate_robots(twin, {name: POINTS}, **SHORT)[name], read)
-
-
-@pytest.mark.parametrize("closed", [False, True])
-def test_points_close_as_a_csv_does(closed, tmp_path):
-    points = [*POINTS, POINTS[0]] if closed else POINTS
-    path, read = path_of_points(points), read_path_csv(csv_of(points, tmp_path / "a.csv"))
-    assert path.closed is read.closed is closed
-    assert np.array_equal(path.p_xy, read.p_xy)
 
 
 def test_ways_are_one_for_all_or_one_each(tmp_path):
@@ -141,16 +120,3 @@ def test_ways_are_one_for_all_or_one_each(tmp_path):
 def test_what_is_no_path_is_refused(twin, way, said):
     with pytest.raises(InputError, match=said):
         simulate(twin, way, **SHORT)
-
-
-def test_the_gym_takes_a_scene_and_points(lab_scene):
-    gymnasium = pytest.importorskip("gymnasium")
-    import magtwin.gym  # noqa: F401
-
-    options = {"path": POINTS, "magnetometer": "map-only"}
-    envs = [
-        gymnasium.make("magtwin/MagNav-v0", scene=s, **options) for s in (lab_scene, read_scene(lab_scene))
-    ]
-    first, second = (env.reset(seed=1)[0] for env in envs)
-    assert first.size
-    assert np.array_equal(first, second, equal_nan=True)

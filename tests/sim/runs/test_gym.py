@@ -54,17 +54,6 @@ def test_gymnasiums_checker_passes(twin, session):
     check_env(gymnasium.make(NAME, scene=twin, session=session).unwrapped)
 
 
-def test_robots_on_a_survey_alone_read_its_map_and_their_own_field(twin):
-    bare = replace(twin, scene=replace(twin.scene, earth=None, sources=(), furniture=()))
-    env = vector(bare, 3)
-    env.reset(seed=1)
-    for _ in range(5):
-        env.step(np.tile(AHEAD, (3, 1)))
-    table = env.unwrapped.stepped.columns
-    assert np.isfinite(table["b_total_nt"]).all()
-    assert (np.abs(table["b_disturbance_nt"]) > 10).all(), "of drawn sessions, in motion"
-
-
 def test_each_episode_is_a_session_of_its_own_unless_that_of_the_survey_is_wanted(twin):
     names = ("battery_fraction", "imu_q_xyzw", "b_total_nt")
     for session in ("drawn", "survey"):
@@ -104,15 +93,6 @@ def test_robots_of_many_days_do_together_what_each_does_in_a_scene_of_its_day(tw
             assert_allclose(together[name][i], values[0], rtol=1e-9, atol=1e-9, err_msg=name)
 
 
-def test_one_seed_is_one_episode_and_another_seed_another(twin):
-    env = gymnasium.make(NAME, scene=twin)
-    actions = np.random.default_rng(1).uniform(-1, 1, (20, 2)).astype(np.float32) * env.action_space.high
-    a, b, c = (drive(env, actions, seed=seed) for seed in (5, 5, 6))
-    assert_array_equal(a[0], b[0])
-    assert_array_equal(a[1], b[1])
-    assert not np.array_equal(a[0], c[0])
-
-
 def test_vectors_agree_with_gymnasiums_own_through_the_ends_of_episodes(twin):
     options = {"scene": twin, "duration_s": 0.5, "random_start": True}
     ours = vector(twin, 2, duration_s=0.5, random_start=True)
@@ -128,18 +108,6 @@ def test_vectors_agree_with_gymnasiums_own_through_the_ends_of_episodes(twin):
         assert a[4].keys() == b[4].keys()
         for name in ("p_world_base", "yaw", "bump", "_bump"):
             assert_allclose(np.asarray(a[4][name], float), np.asarray(b[4][name], float), atol=1e-12)
-
-
-def test_spaces_hold_what_the_documentation_says(twin):
-    env, many = gymnasium.make(NAME, scene=twin), vector(twin, 2)
-    robot = twin.scene.robot.drive
-    assert_allclose(env.action_space.high, [robot.v_max, robot.w_max], rtol=1e-6)
-    assert env.observation_space.shape == (sum(COLUMNS[s].width for s in magtwin.gym.SIGNALS),)
-    assert many.observation_space.shape == (2, *env.observation_space.shape)
-    observations, _ = many.reset(seed=0)
-    assert observations in many.observation_space
-    assert observations.dtype == np.float32
-    assert set(magtwin.gym.BOUNDS) <= set(COLUMNS)
 
 
 def test_sensors_tell_what_the_robot_did_within_their_errors(twin, line):
@@ -171,17 +139,6 @@ def test_the_field_is_the_exact_one_of_a_run_at_the_same_pose(twin, line):
     observation, _ = env.reset(seed=0)
     assert_allclose(observation[1], run["b_map_nt"][0], rtol=1e-6)
     assert_allclose(observation[0], run["b_total_nt"][0], atol=5.0)  # electronics
-
-
-def test_an_episode_is_truncated_by_time_and_not_before(twin):
-    env = vector(twin, 2, duration_s=1.0)
-    env.reset(seed=0)
-    cuts = [env.step(np.zeros((2, 2), np.float32))[3].all() for _ in range(10)]
-    assert cuts == [False] * 9 + [True]
-    _, rewards, ended, truncated, _ = env.step(np.zeros((2, 2), np.float32))
-    assert not rewards.any()
-    assert not ended.any()
-    assert not truncated.any()
 
 
 def test_a_bump_is_told_and_ends_the_episode_where_that_is_asked_for(twin, tmp_path):
@@ -241,15 +198,3 @@ def test_commands_that_are_not_finite_are_refused(twin):
     env.reset(seed=0)
     with pytest.raises(InputError, match="must be finite"):
         env.step([np.nan, 0.0])
-
-
-def test_seeds_must_be_as_many_as_robots(twin):
-    with pytest.raises(InputError, match="one seed for each of the 2 robots, got 3"):
-        magtwin.gym.MagNavVectorEnv(2, scene=twin).reset(seed=[0, 1, 2])
-
-
-def test_a_reward_of_the_wrong_shape_is_refused(twin):
-    env = magtwin.gym.MagNavVectorEnv(2, scene=twin, reward=lambda step: np.zeros(3))
-    env.reset(seed=0)
-    with pytest.raises(InputError, match="reward must give shape"):
-        env.step(np.zeros((2, 2)))

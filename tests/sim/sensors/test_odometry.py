@@ -62,13 +62,6 @@ def test_odometry_drifts_by_the_wheels_errors():
     assert_allclose(yaw_from_quat(odometry["odom_q_xyzw"]), w * stamps[latest], atol=1e-9)
 
 
-def test_wheels_that_slip_are_believed():
-    slipping = Motion(QUIET, 0.02, np.full(3000, 0.18), np.zeros(3000), wheel_v=np.full(3000, 0.2))
-    odometry = Odometry(QUIET, generator()).sense(slipping, T)
-    assert odometry["odom_p"][-1, 0] == pytest.approx(0.2 * 60, abs=0.01)
-    assert slipping.poses[-1, 0] == pytest.approx(0.18 * 60)
-
-
 def test_odometry_errors_have_the_spread_of_the_spec():
     drive = dataclasses.replace(QUIET, odometry_noise_std=0.02)
     t = np.array([0.0, 0.05])
