@@ -258,13 +258,6 @@ def traversals(a: Run, b: Run) -> Traversals:
 
     Two robots at different speeds drift apart, so their fields differ at equal times even if each is right at
     its place. Alignment by path compares them place by place.
-
-    Args:
-        a: The reference run.
-        b: Another run: by another engine, with another seed, or recorded.
-
-    Raises:
-        InputError: As for `compare`.
     """
     a, b = (run.with_columns(t=run["t"] - run["t"][0]) if run.rows else run for run in (a, b))
     recorded, timed = compare(a, b, align="none"), compare(a, b, align="time")

@@ -60,13 +60,7 @@ def sensor_height_m(scene: Scene) -> float:
 
 
 def in_steel(scene: Scene, p: Array, height_m: float) -> NDArray[np.bool_]:
-    """Whether a robot at points (N, 2) of the floor would stand in something magnetised, shape (N,).
-
-    Args:
-        scene: The scene.
-        p: Places of its base [m].
-        height_m: Height of the robot [m]. Things lower than `FLOOR_M` are no obstacle.
-    """
+    """Whether a robot at points (N, 2) of the floor would stand in something magnetised, shape (N,)."""
     radius = scene.robot.footprint_radius_m
     inside = np.zeros(len(p), bool)
     for source in scene.magnets:

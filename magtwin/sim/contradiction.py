@@ -62,10 +62,6 @@ def contradiction_nt(scene: Scene, anomaly_map: AnomalyMap) -> Contradiction:
     Nodes where the robot would stand in something magnetised or lose lock are left out, because a survey has
     no reading there.
 
-    Args:
-        scene: A scene with the Earth's field; its own map is not read.
-        anomaly_map: The map.
-
     Returns:
         The difference. `agrees` is true up to `LEAST_NT`, or `PART` of the map's standard deviation.
     """
@@ -112,11 +108,6 @@ def _in_lock(scene: Scene, p_xy: np.ndarray, height_m: float, asked: np.ndarray)
 
 def check_agrees(scene: Scene, anomaly_map: AnomalyMap, where: str) -> Contradiction | None:
     """Refuse a scene whose map contradicts its Earth and sources.
-
-    Args:
-        scene: The scene. Without the Earth's field, or without sources and furniture, the map is the truth.
-        anomaly_map: Its map.
-        where: Name of the two for the text, such as "lab.toml with the map F.usdc".
 
     Returns:
         The difference if it is small enough; None if there is nothing to contradict.

@@ -75,11 +75,6 @@ def ambient_field_nt(scene: Scene, p_world: ArrayLike) -> Array:
 def level_field_nt(scene: Scene, p_xy: ArrayLike, height_m: float) -> tuple[Array, Array]:
     """`ambient_field_nt` at one height, to 1e-3 nT, and its slopes along x and y, for robots that drive.
 
-    Args:
-        scene: A scene whose Earth's field is known.
-        p_xy: Points [m], shape (N, 2).
-        height_m: Their height above the floor [m].
-
     Returns:
         Field [nT], shape (N, 3), and dB/dx, dB/dy [nT/m], shape (N, 2, 3), in world axes.
     """
@@ -95,11 +90,6 @@ def level_gradient_nt_m(scene: Scene, p_xy: ArrayLike, height_m: float) -> Array
     The vertical slopes follow from those along x and y, because curl B = 0 and div B = 0 outside of
     magnetised things.
 
-    Args:
-        scene: A scene whose Earth's field is known.
-        p_xy: Points [m], shape (N, 2).
-        height_m: Their height above the floor [m].
-
     Returns:
         Gradient [nT/m], shape (N,).
     """
@@ -114,10 +104,6 @@ def level_gradient_nt_m(scene: Scene, p_xy: ArrayLike, height_m: float) -> Array
 
 def ambient_gradient_nt_m(scene: Scene, p_world: ArrayLike) -> Array:
     """Steepness of the lab's field: |grad |B||.
-
-    Args:
-        scene: A scene whose Earth's field is known.
-        p_world: Points [m], shape (..., 3).
 
     Returns:
         Gradient [nT/m], shape (...).
@@ -297,10 +283,6 @@ def ambient_at_sensor_nt(scene: Scene, true: Moment) -> tuple[Array, Array]:
     The rate is d/dt (R^T B) = R^T dB/dt - w x R^T B, with dB/dt = (u . grad) B for the magnetometer's
     velocity u, that of the twist from now on.
 
-    Args:
-        scene: A scene whose Earth's field is known.
-        true: The motion of its robot, N moments.
-
     Returns:
         Field [nT] and rate [nT/s], shape (N, 3) each.
     """
@@ -385,10 +367,6 @@ def draw_platform(platform: PlatformFieldSpec, rng: np.random.Generator) -> Plat
     TurtleBot 4 in Florida, where the field dips by 58 deg, the drift makes 690 nT and a wave of 130 nT; the
     90 nT between sessions make 77 nT and a wave of 70 nT (root mean squares).
 
-    Args:
-        platform: The platform of the asset, in the session of the survey.
-        rng: Source of the session.
-
     Returns:
         The platform with these figures drawn, its drift and spreads 0. `hard_iron_change_nt` is the change
         since the survey.
@@ -423,9 +401,6 @@ def draw_platform(platform: PlatformFieldSpec, rng: np.random.Generator) -> Plat
 
 def platforms_of_rows(platforms: Sequence[PlatformFieldSpec]) -> PlatformFieldSpec:
     """Platforms of many robots as one, for readings that each belong to another robot.
-
-    Args:
-        platforms: Those of one robot in several sessions, from `draw_platform`; one for each reading.
 
     Returns:
         The first platform, with arrays of a row or number per robot for the figures in `DRAWN`.

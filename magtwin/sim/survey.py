@@ -381,14 +381,6 @@ def survey_room(
 ) -> Surveyed:
     """Survey a scene, and fill the nodes that the robot cannot reach.
 
-    Args:
-        scene: A scene whose Earth's field is known; its map is not read.
-        spec: Grid and errors of the survey.
-        seed: Seed of the sensor's noise and of the robot's errors.
-        obstacles: What stands in the room.
-        source: File that the scene was made from.
-        progress: As for `survey_readings`.
-
     Returns:
         The map, and the number of filled nodes.
     """
@@ -426,10 +418,6 @@ def blocked_by(scene: Scene, obstacles: Obstacles) -> Callable[[Array], NDArray[
     """Which nodes the robot cannot stand at, because of obstacles or magnetised things.
 
     Walls at the border of the floor do not count, because the map is needed up to them.
-
-    Args:
-        scene: The scene.
-        obstacles: What stands in it.
 
     Returns:
         A function from nodes [m], shape (..., 2), to whether each is blocked, shape (...).

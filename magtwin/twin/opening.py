@@ -343,16 +343,7 @@ def twin_of(
 
 
 def check_scene(scene: Scene, metadata: Mapping[str, str | int | float | bool], name: str) -> None:
-    """Refuse a scene whose values differ from those that a run was made with.
-
-    Args:
-        scene: The scene, its robot in the run's session.
-        metadata: Metadata of the run.
-        name: Name of the run.
-
-    Raises:
-        InputError: The checksum of the scene's values differs, or the run has none.
-    """
+    """Refuse a scene whose values differ from those that a run was made with."""
     ours, its = scene_sha256(scene), metadata.get("config_sha256", "none")
     if ours != its:
         raise InputError(

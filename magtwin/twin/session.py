@@ -87,15 +87,7 @@ def with_plant(twin: Twin, plant: PlantSpec | str | None) -> Twin:
 
 
 def in_session_of(twin: Twin, metadata: Mapping[str, str | int | float | bool]) -> Twin:
-    """The twin in the session of a run, with the plant and the tracking of the run.
-
-    Args:
-        twin: The twin of the run.
-        metadata: Metadata of the run. Without `session_seed`, the robot is as it was when surveyed.
-
-    Raises:
-        InputError: The metadata name no valid session.
-    """
+    """The twin in the session of a run, with the plant and the tracking of the run."""
     if metadata.get("plant", OF_SCENE) != OF_SCENE:
         twin = with_plant(twin, str(metadata["plant"]))
     if not metadata.get("tracking_error", True):
@@ -110,13 +102,7 @@ def in_session_of(twin: Twin, metadata: Mapping[str, str | int | float | bool]) 
 
 
 def model_error_of(twin: Twin, seed: int, *, which: int = 0) -> ModelError | None:
-    """Statistics of the model error of a twin in its session. None if no error is drawn.
-
-    Args:
-        twin: A twin in a session.
-        seed: Seed of the run.
-        which: Place of the robot in a scene of several, from 0.
-    """
+    """Statistics of the model error of a twin in its session. None if no error is drawn."""
     if twin.model_error is None:
         return None
     return twin.model_error.in_session(offset_generator(twin.session, seed, which=which))

@@ -120,10 +120,6 @@ class ClosedLoop:
 def run_loops(loops: Sequence[ClosedLoop], obstacles: Obstacles | None = None) -> list[Motion]:
     """Drive robots, each as if it were alone; the bytes depend on neither their number nor their order.
 
-    Args:
-        loops: The robots; all with the same length of a step.
-        obstacles: What stands in the room; robots do not meet each other.
-
     Returns:
         The motion of each, until its controller was done and it stood, or its steps were over.
     """

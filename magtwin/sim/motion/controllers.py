@@ -134,15 +134,7 @@ class Guide:
 
 
 def guide_along(name: str, path: Path, drive: DriveSpec, *, speed: float, dt: float) -> Guide:
-    """A controller that follows a path.
-
-    Args:
-        name: One of `CONTROLLERS`.
-        path: Where to drive, as an open line.
-        drive: Its limits, and the lag of its motors, which "follower" compensates.
-        speed: Wanted forward speed [m/s].
-        dt: Time between commands [s].
-    """
+    """A controller that follows a path."""
     law = find("controller", name, CONTROLLERS)
     pieces = plan(drivable(path), drive, speed=speed)
     if law == loop.RELEASE:

@@ -41,12 +41,7 @@ def drive_input(path: Any, room: Room | None = None, *, fit: bool = False) -> Dr
 
 
 def drive_inputs(paths: Any, room: Room | None = None) -> DriveInput | list[DriveInput]:
-    """One input for all runs, or a list with one for each; a repeated name or file is read once.
-
-    Args:
-        paths: What `drive_input` takes, or an iterable of it. Points (N, 2) are one path.
-        room: As for `drive_input`.
-    """
+    """One input for all runs, or a list with one for each; a repeated name or file is read once."""
     single = isinstance(paths, str | FilePath | Path | Commands | Run)
     if single or not hasattr(paths, "__iter__"):
         return drive_input(paths, room)

@@ -95,11 +95,6 @@ def plan(path: Path, drive: DriveSpec, *, speed: float) -> list[Piece]:
     A planned speed is at most `speed` and keeps w = k v, dw/dt = (dk/ds) v^2 and the rate of the outer wheel,
     v (1 + |k| b / 2) / r, within the drive's limits. Each piece begins and ends with a stop, within the limit
     of acceleration.
-
-    Args:
-        path: Where to drive, as an open line.
-        drive: Limits.
-        speed: Wanted forward speed [m/s].
     """
     check_speed(speed, drive)
     if drive.turning_radius_m:

@@ -96,19 +96,7 @@ class LiveRobot:
         outside: Literal["nan", "clamp"] = "nan",
         lidar: LidarMode = "schedule",
     ) -> None:
-        """Put it at the scene's start, at rest.
-
-        Args:
-            scene: As for `magtwin.sim.runs.simulate.simulate`, like all that follows.
-            anomaly_map: The map of `scene.map_layer`.
-            rng: Source of all noise.
-            obstacles: What stops the robot, and what its LiDAR sees.
-            rate_hz: Magnetometer readings a second [Hz]. Default: the scene's.
-            network: Predicts the disturbance of a neural magnetometer.
-            model_error: Statistics of the error of these predictions; None draws no error.
-            outside: What the map reads outside its extent.
-            lidar: Whether the LiDAR follows its schedule, or stays on or off.
-        """
+        """Put it at the scene's start, at rest."""
         robot, obstacles = scene.robot, obstacles or Obstacles()
         conditions = Conditions(
             anomaly_map=anomaly_map,

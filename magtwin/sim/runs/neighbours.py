@@ -79,10 +79,6 @@ def iron_moments(robot: RobotSpec, b_base_nt: ArrayLike) -> Array:
     With r u the vector from there to its magnetometer, and B = h + S b its permanent and induced field there,
     B = mu_0 / 4 pi r^3 (3 (m . u) u - m) has the solution m = 4 pi r^3 / mu_0 (3/2 (B . u) u - B).
 
-    Args:
-        robot: Its platform and magnetometer.
-        b_base_nt: Ambient field b in base_link axes [nT], shape (N, 3).
-
     Returns:
         Moments in base_link axes [A m2], shape (N, 3).
     """
@@ -160,11 +156,7 @@ def _dipole_each_nt(r: Array, m: Array) -> Array:
 
 
 def approaches(travels: Mapping[str, Neighbour]) -> Iterator[Approach]:
-    """Nearest approach of each pair of robots, until the last has arrived; the others stand then.
-
-    Args:
-        travels: The robots by name.
-    """
+    """Nearest approach of each pair of robots, until the last has arrived; the others stand then."""
     end = max(robot.motion.duration_s for robot in travels.values())
     count, found = int(end * SEEN_HZ) + 1, dict[tuple[str, str], Approach]()
     for rows in mapped.parts(count):

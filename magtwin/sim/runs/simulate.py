@@ -149,13 +149,7 @@ class Sensed:
 
 
 def sense_all(sensing: Sensing, motion: Travel, metadata: Mapping[str, str | int | float | bool]) -> Sensed:
-    """Read the sensors of a whole run.
-
-    Args:
-        sensing: Sensors that have not been read yet.
-        motion: What the robot did.
-        metadata: How the motion came about.
-    """
+    """Read the sensors of a whole run."""
     count, known = readings(sensing, motion, metadata)
     t = np.arange(count) / sensing.rate_hz
     return Sensed(Run(sensing.sense(motion, t), known, sensing.specs), sensing)
@@ -170,16 +164,7 @@ def read_all(
     progress: Callable[[int, int, str], Any] | None = None,
     each: Callable[[Run], Any] | None = None,
 ) -> Run:
-    """Read the sensors of a whole run, a long one block by block; the bytes do not depend on the blocks.
-
-    Args:
-        sensing: Sensors that have not been read yet.
-        motion: What the robot did.
-        metadata: How the motion came about.
-        read: Reads the magnetometer of the run, or of a block.
-        progress: Called after each block with readings made, readings in all and the simulated time as text.
-        each: Called with each block of a long run.
-    """
+    """Read the sensors of a whole run, a long one block by block; the bytes do not depend on the blocks."""
     count, known = readings(sensing, motion, metadata)
     whole, rows = Spool(count), sensing.rows_at_once(count)
     for first in range(0, count, rows):

@@ -78,19 +78,7 @@ class SteppedRobots:
         disturbance_nt: Predict | None = None,
         model_error: ModelError | None = None,
     ) -> None:
-        """Make room for robots; `begin` must place each before its first step.
-
-        Args:
-            scene: Lab, robot and sensors.
-            count: How many robots.
-            anomaly_map: The map of the scene; outside its extent it reads the nearest value.
-            obstacles: What stops the robots.
-            step_s: Length of a step [s], a multiple of the control step.
-            disturbance_nt: From a table to the disturbance of a neural magnetometer and the standard
-                deviation of its error.
-            model_error: Statistics of that error, drawn for each robot each time that it begins; None draws
-                no error.
-        """
+        """Make room for robots; `begin` must place each before its first step."""
         kind, timeout = scene.robot.magnetometer.kind, scene.robot.drive.command_timeout_s
         if not isinstance(count, int) or count < 1:
             raise InputError(f"the number of robots must be a whole number from 1 up, got {count!r}")

@@ -93,14 +93,7 @@ class Battery(SampledSensor):
         lidar_on: Callable[[Array], NDArray[np.bool_]],
         rng: np.random.Generator,
     ) -> None:
-        """Begin at rest with the spec's charge.
-
-        Args:
-            spec: Pack, loads, rate, delays and noise.
-            drive: The wheels that are driven.
-            lidar_on: From times [s] to whether the LiDAR spins.
-            rng: Source of delays and noise.
-        """
+        """Begin at rest with the spec's charge."""
         delays, noise = rng.spawn(2)
         super().__init__(noise, spent=0.0, initial=spec.initial_fraction)
         if spec.model == "linear":

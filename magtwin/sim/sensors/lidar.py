@@ -124,14 +124,7 @@ class Scanner:
     def __init__(
         self, robot: RobotSpec, obstacles: Obstacles, rng: np.random.Generator, *, begin_s: float = 0.0
     ) -> None:
-        """Begin a turn.
-
-        Args:
-            robot: Its LiDAR, and where it is mounted.
-            obstacles: What there is to see.
-            rng: Source of delays and noise.
-            begin_s: Time of the first scan [s].
-        """
+        """Begin a turn."""
         self._robot, self._obstacles, self._begin_s = robot, obstacles, begin_s
         self._delays, self._noise = rng.spawn(2)
         self._next, self._arrived = 0, -np.inf
@@ -181,14 +174,7 @@ class Scanner:
 
 
 def scans_of(run: Run, robot: RobotSpec, obstacles: Obstacles, rng: np.random.Generator) -> Scans:
-    """The scans of a LiDAR in a run, one per turn while it spun.
-
-    Args:
-        run: With t, p_world_base, yaw and lidar_on: simulated or recorded.
-        robot: Its LiDAR, and where it is mounted.
-        obstacles: What there is to see.
-        rng: Source of delays and noise.
-    """
+    """The scans of a LiDAR in a run, one per turn while it spun."""
     t, base, yaw = run["t"], run["p_world_base"], np.unwrap(run["yaw"])
     check_count("a LiDAR's scans", t[-1] - t[0], robot.lidar.scan_rate_hz)
 
