@@ -7,7 +7,6 @@ import pytest
 
 import magtwin
 from magtwin.errors import InputError
-from magtwin.files.file import shipped
 from magtwin.twin import in_session, in_session_of, open_twin, simulate, sweep
 from magtwin.twin.opening import geometry
 
@@ -26,13 +25,6 @@ def test_a_run_is_in_a_session_of_its_seed_unless_another_is_chosen(lab_scene):
     offsets = [float(np.mean(run["b_total_nt"] - run["b_map_nt"])) for run in (first, other, surveyed)]
     assert min(offsets[0], offsets[1]) - offsets[2] > 200  # hard_iron_drift_nt since the survey
     assert offsets[0] != offsets[1]
-
-
-def test_a_network_for_a_magnetometer_that_reads_none_is_refused(lab_scene):
-    with pytest.raises(InputError, match="a 'physical' magnetometer has no network"):
-        open_twin(
-            lab_scene, network=shipped("weights", "turtlebot4_paper.safetensors"), magnetometer="physical"
-        )
 
 
 def test_a_sweep_takes_paths_in_turn_and_deals_sessions_in_blocks(lab_scene):

@@ -14,7 +14,7 @@ from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
 from magtwin.path import Path as Way
 from magtwin.path import path_named
 from magtwin.run.run import Run
-from magtwin.sim.exact import ExactField, check_field, check_read
+from magtwin.sim.exact import check_field, check_read
 from magtwin.sim.runs.simulate import simulate
 from magtwin.sim.session import draw_session
 from magtwin.spec.drive import DriveSpec
@@ -173,17 +173,6 @@ def test_a_survey_alone_gives_what_the_sources_that_it_was_made_of_give(session,
     assert np.abs(off).max() < 20
     apart = np.linalg.norm(alone["b_vector_nt"] - exact["b_vector_nt"], axis=1)
     assert np.sqrt(np.mean(apart**2)) < 10
-
-
-def test_earth_without_sources_leaves_a_map_that_varies_the_truth():
-    of = {
-        "sources": [(KNOWN, MAP), (replace(KNOWN, sources=()), FLAT)],
-        "map": [(SURVEYED, MAP), (replace(SURVEYED, earth=EARTH), MAP), (replace(KNOWN, earth=None), MAP)],
-        "none": [(SURVEYED, FLAT)],
-    }
-    for said, cases in of.items():
-        for scene, field in cases:
-            assert ExactField(scene=scene, anomaly_map=field).of == said
 
 
 def test_a_scene_of_a_constant_field_is_refused_with_what_to_do():

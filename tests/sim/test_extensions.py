@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from magtwin.errors import InputError
 from magtwin.path import path_named
 from magtwin.run.run import Column
 from magtwin.sim import extensions
@@ -54,14 +53,6 @@ def test_a_registered_sensor_adds_its_columns_and_changes_no_others(twin):
     assert np.std(run["speed_m_s"] - run["v_base"][:, 0]) == pytest.approx(0.01, rel=0.1)
     for name in plain:
         assert_array_equal(run[name], plain[name], err_msg=name)
-
-
-def test_a_factory_is_taken_as_well_and_a_column_that_exists_is_refused(twin):
-    assert "speed_m_s" in run_of(twin, sensors=[Speedometer])
-    with pytest.raises(InputError, match="add the column 'speed_m_s', which exists already"):
-        run_of(twin, sensors=[Speedometer, "test_speedometer"])
-    with pytest.raises(InputError, match="no sensor 'test_speedometr'; did you mean 'test_speedometer'"):
-        run_of(twin, sensors=["test_speedometr"])
 
 
 def test_an_interference_term_is_added_to_the_field_at_the_sensor(twin):

@@ -10,8 +10,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.features import FULL, features
 from magtwin.path import PATHS, path_named
 from magtwin.sim.runs.simulate import simulate
-from magtwin.sim.session import SPEEDS, draw_session, draw_speed
-from magtwin.spec.drive import DriveSpec
+from magtwin.sim.session import draw_session, draw_speed
 from magtwin.spec.magnetics import EarthFieldSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
@@ -136,11 +135,3 @@ def test_a_session_draws_what_differs_from_day_to_day_and_nothing_else():
     assert robot.drive.odometry_scale[0] != robot.drive.odometry_scale[1]
     assert draw_session(ROBOT, np.random.default_rng(0)) == robot
     assert draw_session(ROBOT, np.random.default_rng(1)) != robot
-
-
-def test_speeds_are_the_real_ones_within_the_drives():
-    rng = np.random.default_rng(0)
-    speeds = [draw_speed(DriveSpec(), rng) for _ in range(1000)]
-    assert min(speeds) == pytest.approx(SPEEDS[0], abs=0.001)
-    assert max(speeds) == pytest.approx(SPEEDS[1], abs=0.001)
-    assert draw_speed(DriveSpec(v_max=0.1), rng) == 0.1

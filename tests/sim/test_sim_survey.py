@@ -7,7 +7,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
-from magtwin.field.maps.difference import difference
 from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.field.sources.magnets import body_of
 from magtwin.frames import quat_from_yaw, rotate
@@ -67,14 +66,6 @@ def test_motors_lidar_battery_and_eddy_currents_are_not_in_the_map():
     assert_array_equal(
         survey(scene(platform=moving), rng=rng()).values_nt, survey(scene(), rng=rng()).values_nt
     )
-
-
-def test_a_finer_map_comes_nearer_to_the_field_by_the_square_of_its_spacing():
-    coarse, fine = (survey(scene(), rng=rng(), spacing_m=s) for s in (0.25, 0.125))
-    p = np.random.default_rng(1).uniform((-2.8, -1.6), (2.8, 1.6), (2_000, 2))
-    exact = field_at_rest_nt(scene(), p, 0.0)
-    off_coarse, off_fine = (np.sqrt(np.mean((m.lookup(p, 0.0) - exact) ** 2)) for m in (coarse, fine))
-    assert off_coarse / off_fine == pytest.approx(4, rel=0.15)
 
 
 def test_readings_have_the_sensors_noise_and_resolution_and_the_map_its_variance():
@@ -201,12 +192,6 @@ def test_a_sensor_that_loses_lock_latches_along_its_rows_and_those_nodes_are_mas
         assert not latched[layer][steep < 3e3].any()
 
 
-# Variance, and what a difference makes of it
-
-ERRORS = {"position_error_m": 0.01, "heading_error_rad": np.radians(2)}
-TWO = (0.0, np.pi)
-
-
 def test_the_variance_of_a_node_is_the_mean_square_of_what_errors_of_the_pose_do_there():
     errors = {"position_error_m": 0.03, "heading_error_rad": np.radians(8)}
     iron = PlatformFieldSpec(hard_iron_nt=(400.0, -250.0, 900.0))
@@ -222,41 +207,3 @@ def test_the_variance_of_a_node_is_the_mean_square_of_what_errors_of_the_pose_do
     ratio = np.mean(off**2, axis=0) / got
     assert ratio.mean() == pytest.approx(1, abs=0.03)
     assert np.abs(ratio - 1).max() < 5 * np.sqrt(2 / times)  # as known as a mean of squares of normals
-
-
-@pytest.fixture(scope="module")
-def lab(lab_scene):
-    from magtwin.usd.scene import read_scene
-
-    return read_scene(lab_scene, check_network=False)
-
-
-@pytest.fixture(scope="module")
-def surveys(lab):
-    return [survey(lab, rng=np.random.default_rng(seed), headings_rad=TWO, **ERRORS) for seed in range(5)]
-
-
-def test_two_surveys_of_one_lab_differ_by_their_variance_and_raise_no_more_false_alarms_than_said(surveys):
-    found = [difference(a, b) for k, b in enumerate(surveys) for a in surveys[:k]]
-    spread = [np.sqrt(np.nanmean(d.z**2)) for d in found]
-    assert np.mean(spread) == pytest.approx(1, abs=0.05)
-    # with no change at all, the false-discovery rate is how often a node is called changed: 5 % of 10 pairs
-    assert sum(d.changed.any() for d in found) <= 2
-
-
-def test_a_desk_that_was_moved_is_marked_and_the_rest_of_the_lab_is_not(lab, surveys):
-    moved = replace(
-        lab,
-        furniture=tuple(
-            replace(f, p_world=(f.p_world[0] + 0.6, *f.p_world[1:])) if f.name == "desk_0" else f
-            for f in lab.furniture
-        ),
-    )
-    found = difference(surveys[0], survey(moved, rng=np.random.default_rng(99), headings_rad=TWO, **ERRORS))
-    desk = np.array([-1.9, 2.3])  # beyond the floor's edge at y = 1.75, 1.5 m wide before and after
-    p, _ = found.grid.poses()
-    near = np.linalg.norm(np.maximum(np.abs(p - desk - [0.3, 0]) - [1.05, 0.4], 0), axis=-1) < 1.5
-    assert found.changed[near].sum() >= 10
-    assert found.changed[~near].sum() <= 0.1 * found.changed.sum() + 3
-    assert max(abs(r.peak_m[0] - desk[0]) for r in found.regions[:2]) < 1.0
-    assert min(r.peak_m[1] for r in found.regions[:2]) > 1.0

@@ -7,14 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
-from magtwin.files.file import shipped
 from magtwin.path import Path, path_named
 from magtwin.run.run import Run
-from magtwin.sim.motion.commands import Commands
 from magtwin.sim.motion.drive_input import drive_input, drive_inputs
-from magtwin.twin import open_twin, scene_from_toml, simulate, simulate_robots, sweep
+from magtwin.twin import open_twin, simulate, simulate_robots, sweep
 from magtwin.usd.scene import read_scene
 
 POINTS = [[-1.0, -0.5], [0.25, 0.5], [1.0, 0.125], [0.5, -0.75]]
@@ -43,20 +40,6 @@ def test_scene_twin_and_file_give_equal_bytes(lab_scene, twin):
     assert metadata[0] == metadata[1]
     assert metadata[0].keys() - metadata[2].keys() <= {"scene_file", "git_revision"}
     assert all(metadata[0][name] == value for name, value in metadata[2].items())
-
-
-def test_a_scene_that_no_file_holds_runs_as_its_stage_does(tmp_path):
-    scene = scene_from_toml(shipped("scenes", "lab.toml"))
-    scene = replace(scene, name="moved", start=(0.5, 0.25, 0.0), furniture=scene.furniture[:3])
-    file = author_scene(scene, tmp_path / "moved")
-    commands = Commands("there", np.array([[0.0, 0.2, 0.4], [2.0, 0.1, -0.4]]))
-    physical = {"magnetometer": "physical", **SHORT}
-    a, b = (simulate(what, commands, **physical) for what in (scene, file))
-    assert same(a, b)
-    assert a.metadata["scene_sha256"] == b.metadata["scene_sha256"]
-    assert simulate(scene, commands, **physical).metadata == a.metadata
-    many = list(sweep(scene, commands, [0], **physical))
-    assert same(many[0], next(iter(sweep(file, commands, [0], **physical))))
 
 
 def test_the_stage_of_a_scene_lasts_as_long_as_its_twins(lab_scene):

@@ -13,7 +13,6 @@ from magtwin.path import PATHS, Path, path_named, read_path_csv
 from magtwin.sim.motion.controllers import CONTROLLERS, guide_along
 from magtwin.sim.motion.drive import Motion, advance, limiter
 from magtwin.sim.motion.follow import follow
-from magtwin.sim.motion.plan import plan
 from magtwin.spec.drive import DriveSpec
 
 REAL = DriveSpec()
@@ -122,13 +121,6 @@ def test_an_open_path_is_driven_back_and_forth_with_turns_on_the_spot():
     assert np.sum(motion.v) * motion.dt > 3 * path.length
 
 
-def test_a_straight_line_takes_the_time_of_its_speed_profile():
-    # 2 m at 0.2 m/s: speeding up and slowing down at 80 % of a_max cost v / a = 0.28 s.
-    motion = follow(Path("line", np.array([[0.0, 0.0], [2.0, 0.0]])), DRIVE, speed=0.2)
-    assert motion.duration_s == pytest.approx(2 / 0.2 + 0.2 / (0.8 * 0.9), abs=0.15)
-    assert_allclose(motion.w, 0, atol=1e-12)
-
-
 def test_on_a_circle_speed_is_what_the_yaw_rate_allows():
     u = np.linspace(0, 4 * np.pi, 2001)
     path = Path("circle", 0.1 * np.column_stack([np.cos(u), np.sin(u)]))
@@ -169,14 +161,6 @@ def test_a_robot_that_is_carried_away_comes_back_to_where_it_left_the_path():
     back = 1001 + np.flatnonzero(np.hypot(*(driven[1001:, :2] - left_at[:2]).T) < 0.06)[0]
     assert np.abs(path.nearest(driven[back + 150 :, :2])[1]).max() < 0.01
     assert np.hypot(*(driven[-1, :2] - path.p_xy[-1])) < 0.002
-
-
-def test_planned_speeds_are_those_of_constant_acceleration():
-    for piece in plan(path_named("lawnmower"), DRIVE, speed=0.2):
-        steps = np.hypot(np.diff(piece.x), np.diff(piece.y))
-        accelerations = np.abs(np.diff(piece.speed2)) / (2 * steps)
-        assert accelerations.max() <= 0.8 * DRIVE.a_max * (1 + 1e-9)
-        assert piece.speed2[0] == piece.speed2[-1] == 0.0
 
 
 @pytest.mark.parametrize(

@@ -228,15 +228,6 @@ def test_no_limit_is_exceeded_whatever_is_commanded(seed, lag):
     assert np.abs(motion.wheel_rates).max() <= drive.wheel_rate_max * slack
 
 
-def test_a_command_that_is_too_old_stops_the_robot(way):
-    motion = play([[0.0, 0.2, 0.0]], PROMPT)
-    assert_allclose(motion.v[:26], 0.2)  # 0.5 s of 0.02 s, the last begun as it is just old enough
-    assert_allclose(motion.v[26:], 0.0)
-    assert_allclose(motion.v_cmd[26:], 0.0)
-    late = play([[1.0, 0.2, 0.0], [1.2, -0.1, 0.0]], PROMPT)
-    assert_allclose(late.v[[49, 50, 59, 60, 85, 86]], [0.0, 0.2, 0.2, -0.1, -0.1, 0.0])
-
-
 # --- contact ----------------------------------------------------------------------------------------------
 
 
@@ -353,12 +344,6 @@ def test_a_chassis_tells_where_it_is_and_what_it_touches():
 # --- refusals ---------------------------------------------------------------------------------------------
 
 
-class Broken(Straight):
-    def command(self, t, x, y, yaw, v, w):
-        super().command(t, x, y, yaw, v, w)
-        return (math.nan if t > 0.09 else 0.2), 0.0
-
-
 @pytest.mark.parametrize(
     ("script", "says"),
     [
@@ -373,11 +358,6 @@ class Broken(Straight):
 def test_a_script_that_cannot_be_played_is_refused(script, says):
     with pytest.raises(InputError, match=says):
         play(script, REAL)
-
-
-def test_a_nan_command_of_ones_own_controller_is_refused_with_its_time():
-    with pytest.raises(InputError, match=r"the command at 0\.100 s is not finite: v = nan m/s"):
-        follow(LINE, REAL, speed=0.2, controller=Broken())
 
 
 def test_a_start_in_a_wall_is_refused_with_its_place():

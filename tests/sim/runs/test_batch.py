@@ -58,12 +58,6 @@ def test_runs_are_those_of_simulate_to_the_last_bit_whatever_the_block(neural, a
         assert_same(run, own)
 
 
-def test_a_physical_magnetometers_runs_are_those_of_simulate_too(physical):
-    runs = sweep(physical, PATHS[:3], SEEDS[:3], **SHORT)
-    for run, path, seed in zip(runs, PATHS, SEEDS, strict=False):
-        assert_same(run, simulate(physical, path, seed=seed, **SHORT))
-
-
 @pytest.fixture(scope="module")
 def others(neural) -> list[Commands | Run | str]:
     """What can be driven beside paths."""
@@ -166,12 +160,3 @@ def test_bad_input_is_refused_before_anything_is_driven(physical, change, text):
     paths, seeds = options.pop("paths"), options.pop("seeds")
     with pytest.raises(InputError, match=text):
         sweep(physical, paths, seeds, **options)
-
-
-def test_plans_beyond_their_limit_are_made_again(physical, monkeypatch):
-    speeds = [0.1, 0.15, 0.2]
-    kept = [run["p_world_base"] for run in sweep(physical, "figure8", 3, speeds=speeds, duration_s=5.0)]
-    monkeypatch.setattr(batch, "PLANNED", 1)
-    runs = sweep(physical, "figure8", 3, speeds=speeds, duration_s=5.0)
-    assert len(runs._planned) == 1
-    assert all(np.array_equal(run["p_world_base"], p) for run, p in zip(runs, kept, strict=True))

@@ -6,8 +6,6 @@ import signal
 import traceback
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 import magtwin as mt
@@ -131,26 +129,6 @@ def test_parquet_of_a_long_run_is_read_in_blocks(run, tmp_path, monkeypatch, lon
     assert again.spec("head_k") == spec
     assert max(seen) <= 384
     assert sum(seen) == ROWS
-
-
-@pytest.mark.parametrize(
-    ("name", "row", "value", "message"),
-    [
-        ("flag_bump", 1000, 2.0, "'flag_bump', row 1000: a flag is 0 or 1, got 2"),
-        ("b_total_nt", 600, None, "'b_total_nt', row 600: no value"),
-        ("t", 1500, 0.0, r"row 1500 has 0 s after 11\.1"),
-        ("t", 1500, np.nan, "t must be finite, got nan in row 1500"),
-    ],
-)
-def test_faults_in_a_long_table_are_named_by_their_row(run, tmp_path, long_runs, name, row, value, message):
-    columns = {key: run[key].astype(float).tolist() for key in ("t", "b_total_nt", "flag_bump")}
-    columns[name][row] = value
-    pq.write_table(
-        pa.table({key: pa.array(values, pa.float64()) for key, values in columns.items()}),
-        tmp_path / "a.parquet",
-    )
-    with pytest.raises(InputError, match=message):
-        read_run(tmp_path / "a.parquet")
 
 
 def resident_mb():

@@ -21,12 +21,10 @@ from magtwin.run.run import Run
 from magtwin.sim.motion.drive import Motion
 from magtwin.sim.runs.multi_robot import simulate_robots as run_robots
 from magtwin.sim.runs.neighbours import Neighbour, iron_moments, neighbours_field_nt
-from magtwin.sim.runs.simulate import simulate
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec
 from magtwin.spec.robot import PlacedRobot, RobotSpec
 from magtwin.spec.scene import Scene
-from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.twin import Twin, scene_from_toml, simulate_robots
 from magtwin.twin import simulate as simulate_one
 
@@ -157,17 +155,6 @@ def test_what_a_robot_drives_past_adds_eddy_currents_by_the_rate_of_its_field():
     assert_allclose((with_eddy - plain)[1:-1], want[1:-1], atol=2e-3 * np.abs(want).max())
 
 
-def test_a_network_predicts_without_the_others_whose_iron_comes_to_it():
-    neural = MagnetometerSpec(kind="neural")
-    scene = replace(SCENE, robot=replace(SCENE.robot, magnetometer=neural))
-    run = drive(scene, disturbances_nt={"ann": lambda table: np.full(table.rows, 300.0)}, wanted=["ann"])[
-        "ann"
-    ]
-    exact = drive(wanted=["ann"])["ann"]
-    alone = simulate(SCENE, EAST, anomaly_map=FLAT, rng=rngs("ann")["ann"], rate_hz=RATE_HZ)
-    assert_allclose(run["b_disturbance_nt"] - 300.0, exact["b_truth_nt"] - alone["b_truth_nt"], atol=1e-8)
-
-
 def test_robots_that_would_meet_are_refused_with_time_and_place():
     ways = {"ann": line("east", (-1, 0), (1, 0)), "bob": line("west", (1, 0), (-1, 0)), "cleo": FAR}
     # they touch when each has gone 1 - 0.171 m; at 0.2 m/s, after 0.15 s to get going
@@ -186,13 +173,6 @@ def test_bumps_are_flagged_in_both_while_they_overlap_where_that_is_asked_for():
         assert_array_equal(runs[name]["flag_bump"], apart < 0.342)
     assert not runs["cleo"]["flag_bump"].any()
     assert runs["cleo"].metadata["nearest_clearance_m"] > 0.5
-
-
-def test_one_robots_run_is_the_same_whichever_runs_are_wanted(passing):
-    one = drive(wanted=["bob"])
-    assert list(one) == ["bob"]
-    for name, values in one["bob"].items():
-        assert_array_equal(values, passing["bob"][name], err_msg=name)
 
 
 @pytest.mark.parametrize(

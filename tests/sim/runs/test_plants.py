@@ -15,7 +15,6 @@ from magtwin.sim.plant_families import PLANTS, draw_plant
 from magtwin.sim.runs.live import LiveRobot
 from magtwin.spec.plant import PlantSpec
 from magtwin.twin import (
-    author_scene,
     in_session,
     open_twin,
     simulate,
@@ -103,20 +102,6 @@ def test_a_plant_given_as_a_spec_is_in_the_metadata_and_the_run_comes_out_again(
     damaged = run.with_metadata(plant='{"warm_up_s": 3}')
     with pytest.raises(InputError, match="warm_up_s must be"):
         repeat(damaged)
-
-
-def test_the_scenes_own_plant_survives_the_stage_and_an_argument_replaces_it(twin, lab_scene, tmp_path):
-    scene = replace(twin.scene, robot=replace(twin.scene.robot, plant=draw_plant("all", 5)))
-    opened = open_twin(author_scene(scene, tmp_path / "planted"))
-    assert opened.scene.robot.plant == draw_plant("all", 5)
-    run = simulate(opened, "figure8", seed=3, **BRIEF)
-    assert run.metadata["plant"] == "of the scene"
-    assert repeat(run).equal
-    given = simulate(twin, "figure8", seed=3, plant="all:5", **BRIEF)
-    assert_array_equal(run["b_truth_nt"], given["b_truth_nt"])
-    without = simulate(opened, "figure8", seed=3, plant="nominal", **BRIEF)
-    assert repeat(without).equal
-    assert np.abs(added_nt(run, without)).max() > 20
 
 
 def test_the_commands_take_a_plant_and_reproduce_takes_it_from_the_run(lab_scene, twin, tmp_path, capsys):

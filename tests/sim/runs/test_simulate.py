@@ -201,32 +201,6 @@ def test_a_network_gives_the_disturbance_from_columns_that_are_filled():
     assert np.isnan(run["b_vector_nt"]).all()
 
 
-def test_the_maps_gradient_is_what_a_step_forward_or_to_the_left_changes_it_by():
-    run, h = drive(), 1e-5
-    p, yaw = run["p_world_base"][:, :2], run["yaw"]
-    forward = h * np.column_stack([np.cos(yaw), np.sin(yaw)])
-    left = h * np.column_stack([-np.sin(yaw), np.cos(yaw)])
-    for i, step in enumerate((forward, left)):
-        change = (MAP.lookup(p + step, yaw) - MAP.lookup(p, yaw)) / h
-        inside = np.isfinite(change) & (np.abs(change - run["b_map_gradient_nt_m"][:, i]) < 1)
-        assert inside.mean() > 0.99  # but where a step leads into the next cell
-
-
-def test_a_network_reads_the_vector_axes_as_the_run_will_have_them():
-    loud = dataclasses.replace(ROBOT.magnetometer, vector_noise_density_nt=5.0, dropout_share=0.1)
-    seen: list[Run] = []
-
-    def network(run: Run) -> np.ndarray:
-        seen.append(run)
-        return np.full(run.rows, 100.0)
-
-    run = drive(with_robot(KNOWN, magnetometer=loud), disturbance_nt=network)
-    read = seen[0]["b_vector_measured_nt"]
-    assert np.isnan(read).any()
-    assert np.isfinite(read).any()
-    assert_array_equal(read, run["b_vector_measured_nt"])
-
-
 def test_every_error_has_an_address():
     spec = MagnetometerSpec(
         noise_density_nt=0.5, bandwidth_hz=20.0, heading_error_nt=3.0, vector_bias_nt=(50, 0, 0)
@@ -289,24 +263,6 @@ def test_lock_is_lost_beside_steel_and_found_again_farther_on():
         run["b_measured_nt"][~lost],
         drive(with_robot(scene, magnetometer=MagnetometerSpec()))["b_measured_nt"][~lost],
     )
-
-
-def test_lock_does_not_depend_on_how_often_it_is_read():
-    spec = MagnetometerSpec(gradient_max_nt_m=60e3, gradient_relock_nt_m=30e3)
-    scene = with_robot(dataclasses.replace(KNOWN, sources=(STEEP,)), magnetometer=spec)
-    seldom, often = (drive(scene, rate_hz=rate)["flag_lost_lock"] for rate in (5.0, 100.0))
-    assert_array_equal(seldom, often[::20])
-
-
-@pytest.mark.parametrize("outside", ["nan", "clamp"])
-def test_poses_off_the_map_are_flagged_whatever_they_read(outside):
-    small = wavy_map((0.5, 3.5))
-    run = drive(anomaly_map=small, outside=outside)
-    off = np.abs(run["p_world_base"][:, 0]) > 0.25
-    assert_array_equal(run["flag_outside_map"], off)
-    assert_array_equal(np.isnan(run["b_map_nt"]), off if outside == "nan" else np.zeros_like(off))
-    assert_array_equal(np.isnan(run["b_measured_nt"]), np.isnan(run["b_map_nt"]))
-    assert np.isfinite(run["b_truth_nt"]).all()
 
 
 def test_a_wall_that_a_corner_swings_over_is_a_bump():

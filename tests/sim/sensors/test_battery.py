@@ -1,7 +1,5 @@
 """Battery: energy bookkeeping, closed forms of the load, sag, the discharge curve, the linear model."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,7 +11,6 @@ from magtwin.sim.sensors.battery import (
     STEP_S,
     Battery,
     Discharge,
-    current_a,
     open_voltage,
     wheels_energy_j,
 )
@@ -76,15 +73,6 @@ def test_the_load_is_that_of_electronics_lidar_and_motors():
     assert driving - standing == pytest.approx(work, rel=1e-9)
 
 
-def test_a_turn_on_the_spot_costs_the_way_of_both_wheels():
-    spec = BatterySpec()
-    turning = Motion(DRIVE, 0.02, np.zeros(500), np.full(500, 1.0))
-    times = np.arange(0.0, 10.0, 0.05)
-    rim = 1.0 * DRIVE.wheel_separation_m / 2
-    energy = wheels_energy_j(spec, DRIVE, turning.at(times))
-    assert_allclose(energy, spec.drag_n * rim * 0.05 / spec.motor_efficiency, rtol=1e-9)
-
-
 @pytest.mark.parametrize("model", ["power", "linear"])
 def test_charge_is_never_below_0_and_an_empty_pack_stays_empty(model):
     spec = BatterySpec(model=model, capacity_wh=0.1, initial_fraction=0.5)
@@ -93,16 +81,6 @@ def test_charge_is_never_below_0_and_an_empty_pack_stays_empty(model):
     assert_array_equal(pack.fraction[round(30 / STEP_S) :], 0)
     assert np.isfinite(pack.voltage_v).all()
     assert np.isfinite(pack.current_a).all()
-
-
-def test_the_current_is_the_smaller_root_of_power_through_a_resistance():
-    spec = BatterySpec(resistance_ohm=0.2)
-    u = float(open_voltage(spec, 0.5))
-    power = np.array([0.0, 5.0, 50.0])
-    root = (u - np.sqrt(u * u - 4 * 0.2 * power)) / (2 * 0.2)
-    assert_allclose(current_a(spec, power, np.full(3, 0.5)), root, rtol=1e-12)
-    spec = dataclasses.replace(spec, resistance_ohm=0.0)
-    assert_allclose(current_a(spec, power, np.full(3, 0.5)), power / u)
 
 
 def test_the_linear_model_is_the_papers():

@@ -18,7 +18,6 @@ from magtwin.spec.robot import RobotSpec
 from magtwin.spec.sensors import LidarSpec
 
 QUIET = LidarSpec(range_noise_std_m=0.0, latency_s=0.0, jitter_s=0.0)
-LEVEL = (0.0, 0.0, 0.0, 1.0)
 FACES = ((0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6), (0, 2, 6),
          (0, 6, 4), (1, 5, 7), (1, 7, 3))  # fmt: skip
 
@@ -107,21 +106,6 @@ def test_a_scan_among_boxes_is_what_a_plain_ray_caster_sees_however_the_lidar_le
     agree = np.isclose(ranges, wanted, rtol=1e-6) | (np.isinf(ranges) & np.isinf(wanted))
     assert np.count_nonzero(~agree) <= 1
     assert np.isfinite(wanted).any() or not np.isfinite(ranges).any()
-
-
-def test_too_far_is_inf_and_too_near_is_minus_inf():
-    spec = LidarSpec(rays=4, range_noise_std_m=0.0, range_min_m=0.5, range_max_m=2.0)
-    ranges = scan(square(4.0), ((1.7, 0.5, 0.2), LEVEL), spec)
-    assert_allclose(ranges, [np.inf, np.inf, -np.inf, 1.5])
-    assert_array_equal(scan(Obstacles(), ((0, 0, 0), LEVEL), spec), np.full(4, np.inf))
-
-
-def test_noise_of_a_range_has_the_spread_of_the_spec():
-    spec = LidarSpec(rays=20_000, range_noise_std_m=0.03)
-    pose = ((0.0, 0.0, 0.2), LEVEL)
-    noise = scan(square(4.0), pose, spec, np.random.default_rng(0)) - scan(square(4.0), pose, spec)
-    assert noise.std() == pytest.approx(0.03, rel=0.02)
-    assert noise.mean() == pytest.approx(0.0, abs=4 * 0.03 / np.sqrt(spec.rays))
 
 
 def a_run(lidar: np.ndarray | None = None) -> Run:

@@ -6,7 +6,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from test_network import a_net
 
 from magtwin import simulate, sweep
-from magtwin.errors import MismatchWarning
 from magtwin.run.run import COLUMNS
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.twin import Twin, in_session, open_twin
@@ -43,11 +42,6 @@ def test_the_variance_is_that_of_the_prediction_whatever_that_is():
     )
     assert_allclose(errors.std(axis=0), sd, rtol=0.02)  # 20,000 draws tell it to 0.5 %
     assert_allclose(errors.mean(axis=0), 0, atol=0.03 * sd.max())
-
-
-def test_the_offset_is_a_constant_where_the_prediction_is_less_sure_than_it():
-    error = ModelError(OFFSET, TIME_S, offset=-1.5).error_nt([80.0, 200.0, 5000.0, 40.0], np.zeros(4))
-    assert_allclose(error, [-120.0, -120.0, -120.0, -60.0])
 
 
 @pytest.mark.parametrize("rate_hz", [5.0, 20.0, 135.0])
@@ -103,15 +97,6 @@ def test_a_session_has_one_offset_and_another_session_another(lab_scene, tmp_pat
     assert a == again == many_a
     assert b == other == many_b
     assert abs(a - b) > 1e-3 * SD
-
-
-@pytest.mark.parametrize("options", [{"residual_sd_nt": SD}, {"metadata": FACTS}])
-def test_weights_that_do_not_say_how_their_error_varies_draw_none_and_warn(lab_scene, tmp_path, options):
-    with pytest.warns(MismatchWarning, match="has no statistics of its error"):
-        twin = open_twin(lab_scene, network=weights(tmp_path, **options))
-    run = simulate(twin, "sine", **SHORT)
-    assert_array_equal(run["b_model_error_nt"], 0)
-    assert run.metadata["model_error"] is False
 
 
 def test_a_vector_of_robots_has_an_error_and_draws_the_rest_as_without(twin):

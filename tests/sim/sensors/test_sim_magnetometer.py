@@ -66,18 +66,6 @@ def test_flicker_noise_falls_as_1_over_f_to_its_corner():
 # What it makes of a field
 
 
-def test_the_noise_column_is_all_that_the_sensor_adds():
-    spec = MagnetometerSpec(
-        noise_density_nt=0.5,
-        flicker_corner_hz=1.0,
-        resolution_nt=0.01,
-        bandwidth_hz=5.0,
-        heading_error_nt=3.0,
-    )
-    columns = read(spec, wave(1.0))
-    assert_allclose(wave(1.0) + columns["b_noise_nt"], columns["b_measured_nt"], rtol=0, atol=1e-10)
-
-
 @pytest.mark.parametrize("frequency_hz", [0.5, 4.0, 12.0])
 def test_the_low_pass_is_of_first_order(frequency_hz):
     corner = 4.0
@@ -91,13 +79,6 @@ def test_the_low_pass_is_of_first_order(frequency_hz):
     assert abs(gain - want) < 1e-3 + (np.pi * frequency_hz / RATE_HZ) ** 2 / 3 * abs(want)
 
 
-@pytest.mark.parametrize("offset_s", [0.02, -0.0137])
-def test_a_clock_that_is_ahead_reads_the_field_of_before(offset_s):
-    ramp = 40_000 + 2.0 * np.arange(N)
-    got = scalar(replace(QUIET, clock_offset_s=offset_s), ramp)
-    assert_allclose((ramp - got)[10:-10], 2.0 * RATE_HZ * offset_s, rtol=1e-9)
-
-
 def test_the_heading_error_follows_the_cosine_to_the_optical_axis():
     angle = np.linspace(0, np.pi, N)
     vector = 45_000 * np.column_stack([np.sin(angle), np.zeros(N), np.cos(angle)])
@@ -105,16 +86,6 @@ def test_the_heading_error_follows_the_cosine_to_the_optical_axis():
     assert_allclose(off, 3.0 * np.cos(angle), atol=1e-10)
     unknown = np.full((N, 3), np.nan)
     assert_array_equal(read(replace(QUIET, heading_error_nt=3.0), FLAT, unknown)["b_noise_nt"], 0)
-
-
-def test_the_share_of_readings_that_drop_out_is_as_said():
-    columns = read(
-        replace(QUIET, dropout_share=0.2), np.full(20_000, 41_000.0), np.tile(DOWN[:1], (20_000, 1))
-    )
-    missing = np.isnan(columns["b_measured_nt"])
-    assert missing.mean() == pytest.approx(0.2, abs=4 * math.sqrt(0.16 / 20_000))
-    assert_array_equal(np.isnan(columns["b_noise_nt"]), missing)
-    assert not columns["flag_lost_lock"].any()
 
 
 # Lock
@@ -197,15 +168,6 @@ def test_calibration_errors_come_back_by_a_fit():
     pointing = gain / gain.diagonal()[:, None] - np.eye(3)  # row i: e_i and the misalignment
     assert_allclose(pointing, np.reshape(spec.vector_misalignment, (3, 3)), atol=2e-6)
     assert_allclose(gain, vector_gain(spec), atol=1e-6)
-
-
-def test_an_axis_has_its_noise_density_at_a_third_of_the_rate():
-    spec = replace(QUIET, vector_noise_density_nt=0.5)
-    count = 90_000
-    b = np.tile([20_000.0, 0.0, -40_000.0], (count, 1))
-    got = read(spec, np.full(count, 44_721.0), b)["b_vector_measured_nt"][2::3] - b[2::3]
-    _, power = welch(got[:, 0], RATE_HZ / 3, nperseg=256)
-    assert power[5:-5].mean() == pytest.approx(0.25, rel=0.03)
 
 
 def test_lost_lock_holds_the_vector_and_dropouts_drop_it():
