@@ -266,25 +266,22 @@ def check_read(run: Run, anomaly_map: AnomalyMap) -> None:
     if not {"p_world_base", "b_map_nt", "b_total_nt"} <= set(run) or not run.rows:
         return
     mapped, p = run["b_map_nt"], run["p_world_base"][:, :2]
-    x0, x1, y0, y1 = anomaly_map.extent
+    moved = run.rows > 1 and np.ptp(p, axis=0).any()
     if np.isfinite(run["b_total_nt"]).any():
-        if (
-            run.rows == 1
-            or np.ptp(mapped) > 0
-            or anomaly_map.contains(p).any()
-            or not np.ptp(p, axis=0).any()
-        ):
+        if not moved or np.ptp(mapped) > 0 or anomaly_map.contains(p).any():
             return
-        what = f"all {run.rows:,} readings are {mapped[0]:,.0f} nT, the map's nearest value, as the robot"
+        what = f"{mapped[0]:,.0f} nT, the map's nearest value"
     elif np.isfinite(mapped).any():
         raise InputError(
             f"all {run.rows:,} readings are nan though the robot drove on the map: the network gives nan, as "
             "one of its inputs is not known here; take a physical magnetometer, or another network"
         )
     else:
-        what = f"all {run.rows:,} readings are nan, as the robot"
+        what = "nan"
+    x0, x1, y0, y1 = anomaly_map.extent
     low, high = p.min(axis=0), p.max(axis=0)
     raise InputError(
-        f"{what} drove x {low[0]:.2f}..{high[0]:.2f}, y {low[1]:.2f}..{high[1]:.2f} m, where the map "
-        f"{anomaly_map.name!r} (x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m) has no valid node; choose a path on it"
+        f"all {run.rows:,} readings are {what}, as the robot drove x {low[0]:.2f}..{high[0]:.2f}, "
+        f"y {low[1]:.2f}..{high[1]:.2f} m, where the map {anomaly_map.name!r} (x {x0:g}..{x1:g}, "
+        f"y {y0:g}..{y1:g} m) has no valid node; choose a path on it"
     )

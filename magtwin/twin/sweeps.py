@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import math
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path as FilePath
@@ -109,6 +108,7 @@ def sweep(
     from magtwin.sim.exact import check_field
     from magtwin.sim.runs.batch import BLOCK, Job, Runs
     from magtwin.sim.runs.sensing import Conditions
+    from magtwin.sim.runs.simulate import check_asked
 
     twin = opened(twin, network, magnetometer, model_error, "sweep")
     if plant is not None and robots is not None:
@@ -147,10 +147,7 @@ def sweep(
         check_commands(path, twin.magnetometer)
         jobs.append(Job(own.scene, path, number, speed))
     predictor = twin.magnetometer
-    if duration_s is not None and not 0 < duration_s < math.inf:
-        raise InputError(
-            f"duration_s must be above 0 s and finite, got {duration_s!r}", parameter="duration_s"
-        )
+    check_asked(duration_s, rate_hz)
     finish = _Finish(predictor, twin.field, tuple(known.values()), duration_s)
     conditions = Conditions(
         anomaly_map=twin.field,

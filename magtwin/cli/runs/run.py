@@ -188,7 +188,7 @@ def run(
     ):
         if given:
             raise InputError(f"{option} {fault}, and {what} is none; drop one")
-    check_asked(speed, duration_s, sensing.rate_hz)
+    check_asked(duration_s, sensing.rate_hz, speed)
     if engine == "newton":
         from magtwin.sim.engines.newton import check_installed
 

@@ -104,7 +104,7 @@ def sweep(
         if value is not None and value < least:
             raise InputError(f"--{name} must be a whole number from {least} up, got {value}")
     check_count(count)
-    check_asked(0.2 if speed is None else speed, duration_s, sensing.rate_hz)
+    check_asked(duration_s, sensing.rate_hz, 0.2 if speed is None else speed)
     if sessions is not None and session is not None:
         raise InputError("--session survey is one session; drop --sessions")
     check_free(out, force=force)

@@ -2,7 +2,6 @@
 
 import struct
 from collections.abc import Iterator, Sequence
-from typing import Protocol
 
 import numpy as np
 
@@ -27,28 +26,24 @@ KEYS = {
 HELP = "w/s or up/down: speed, a/d or left/right: turn, x: straight on, space: stop, q: end"
 
 
-class Hand(Protocol):
+class Hand:
     """An input device; its input so far gives the present command."""
-
-    command: tuple[float, float]
-    """Forward speed [m/s] and yaw rate [rad/s]."""
-
-    done: bool
-    """Whether the drive is to end."""
-
-    def feed(self, data: bytes) -> None:
-        """Take bytes from the device; no bytes mean its end."""
-
-
-class Keyboard:
-    """The keys of a terminal. Key releases are unknown, so each press changes the speeds by a step."""
 
     def __init__(self, drive: DriveSpec) -> None:
         """Stand still."""
-        self._drive = drive
-        self._rest = b""
+        self._drive, self._rest = drive, b""
         self.command = 0.0, 0.0
+        """Forward speed [m/s] and yaw rate [rad/s]."""
         self.done = False
+        """Whether the drive is to end."""
+
+    def feed(self, data: bytes) -> None:
+        """Take bytes from the device; no bytes mean its end."""
+        raise NotImplementedError
+
+
+class Keyboard(Hand):
+    """The keys of a terminal. Key releases are unknown, so each press changes the speeds by a step."""
 
     def feed(self, data: bytes) -> None:
         """As for `Hand`; other keys are ignored."""
@@ -83,7 +78,7 @@ class Keyboard:
         self.command = v, min(max(round(w, 9), -drive.w_max), drive.w_max)
 
 
-class Gamepad:
+class Gamepad(Hand):
     """A gamepad of Linux (/dev/input/js0): left stick drives, Start ends.
 
     Its events are 8 bytes: time [ms], value, type (1 button, 2 axis; plus 128 for the initial state), and
@@ -95,13 +90,6 @@ class Gamepad:
 
     END = (7, 9)
     """Numbers of the Start button on pads of two makers."""
-
-    def __init__(self, drive: DriveSpec) -> None:
-        """Stand still."""
-        self._drive = drive
-        self._rest = b""
-        self.command = 0.0, 0.0
-        self.done = False
 
     def feed(self, data: bytes) -> None:
         """As for `Hand`."""

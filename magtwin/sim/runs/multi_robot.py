@@ -75,35 +75,21 @@ def simulate_robots(
         if wanted is not None and name not in wanted:
             continue
         others = [other for key, other in robots.items() if key != name]
-        own = partial(
-            _read,
-            predict=predicts[name],
-            model_error=(model_errors or {}).get(name),
-            metadata={"robot": name, **_nearest(name, near)},
-            complete=partial(complete, name),
-        )
+        about = {"robot": name, **_nearest(name, near)}
+
+        def read(sensed: Sensed, name: str = name, about: Mapping[str, Any] = about) -> Run:
+            run = sensed.predicted(predicts[name], (model_errors or {}).get(name))
+            return complete(name, run.with_metadata(**about))
+
         runs[name] = read_all(
             Sensing(led[name], trip.draws, conditions[name], neighbours=others),
             robots[name].motion,
             trip.course.metadata,
-            own,
+            read,
             progress=progress,
             each=None if each is None else partial(each, name),
         )
     return runs
-
-
-def _read(
-    sensed: Sensed,
-    *,
-    predict: Predict | None,
-    model_error: ModelError | None,
-    metadata: Mapping[str, str | float],
-    complete: Callable[[Run], Run],
-) -> Run:
-    """Read the magnetometer of a run, or of a block of it."""
-    run = sensed.read(None if predict is None else predict(sensed.run), model_error)
-    return complete(run.with_metadata(**metadata))
 
 
 def _check_apart(near: Iterable[Approach]) -> None:

@@ -98,8 +98,7 @@ def simulate(
     (motion,) = drive([Trip(scene, course, draws)], conditions)
 
     def read(sensed: Sensed) -> Run:
-        predicted = None if disturbance_nt is None else disturbance_nt(sensed.run)
-        return complete(sensed.read(predicted, model_error))
+        return complete(sensed.predicted(disturbance_nt, model_error))
 
     return read_all(sensing, motion, course.metadata, read, progress=progress, each=each)
 
@@ -108,10 +107,7 @@ def check_run(scene: Scene, path: DriveInput, conditions: Conditions) -> None:
     """Check the arguments of `simulate`."""
     robot = scene.robot
     rate = robot.magnetometer.rate_hz if conditions.rate_hz is None else conditions.rate_hz
-    if not 0 < rate < math.inf:
-        raise InputError(
-            f"rate_hz of the magnetometer must be above 0 Hz and finite, got {rate!r}", parameter="rate_hz"
-        )
+    check_asked(conditions.duration_s, rate)
     if not conditions.network:
         if robot.magnetometer.kind == "neural":
             raise InputError(
@@ -146,6 +142,10 @@ class Sensed:
         """Read the magnetometer, once; returns the whole run. Arguments as for `Sensing.read`."""
         columns = self.sensing.read(self.run.columns, predicted, model_error)
         return Run(columns, self.run.metadata, self.sensing.specs)
+
+    def predicted(self, predict: Predict | None, model_error: ModelError | None) -> Run:
+        """Read the magnetometer with what a network predicts of the other columns."""
+        return self.read(None if predict is None else predict(self.run), model_error)
 
 
 def sense_all(sensing: Sensing, motion: Travel, metadata: Mapping[str, str | int | float | bool]) -> Sensed:
@@ -237,15 +237,13 @@ def _check_numbers(robot: RobotSpec) -> None:
             raise InputError(f"robot {robot.name!r}: {text}")
 
 
-def check_asked(speed: float, duration_s: float | None, rate_hz: float | None) -> None:
+def check_asked(duration_s: float | None, rate_hz: float | None, speed: float = 0.2) -> None:
     """Refuse values that no robot allows. It needs no scene, so it comes before one is opened."""
     if not 0 < speed <= FASTEST:
         text = f"speed must be above 0 m/s and at most the drive's v_max, got {speed!r}"
         raise InputError(text, parameter="speed")
-    for value, what, unit in (
-        (duration_s, "duration_s", "s"),
-        (rate_hz, "rate_hz of the magnetometer", "Hz"),
-    ):
+    asked = (duration_s, "duration_s", "s"), (rate_hz, "rate_hz of the magnetometer", "Hz")
+    for value, what, unit in asked:
         if value is not None and not 0 < value < math.inf:
             text = f"{what} must be above 0 {unit} and finite, got {value!r}"
             raise InputError(text, parameter=what.partition(" ")[0])
@@ -253,10 +251,6 @@ def check_asked(speed: float, duration_s: float | None, rate_hz: float | None) -
 
 def _check_readings(duration_s: float, rate_hz: float) -> None:
     """Refuse a run whose columns no memory can hold, or a rate of no magnetometer."""
-    if not math.isfinite(duration_s):
-        raise InputError(
-            f"duration_s must be above 0 s and finite, got {duration_s!r}", parameter="duration_s"
-        )
     if duration_s * rate_hz > MOST_READINGS:
         raise InputError(
             f"{duration_s:g} s at {rate_hz:g} Hz make {duration_s * rate_hz:.3g} readings, more than "
