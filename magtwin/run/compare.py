@@ -1,6 +1,5 @@
 """Comparison: two runs aligned, and their differences in pose and field."""
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -117,10 +116,6 @@ class Comparison(Summarized):
                 for a in self.agreements()
             },
         }
-
-    def to_json(self) -> str:
-        """The comparison as one JSON object."""
-        return json.dumps(self.summary(), indent=2)
 
     def _summary(self) -> Summary:
         """The alignment, and the difference of each quantity."""

@@ -36,7 +36,7 @@ LEAST_REACH_M = 0.01
 QUARTERS = (0.0, np.pi / 2, np.pi, 3 * np.pi / 2)
 
 
-def survey_readings(
+def visit(
     scene: Scene,
     *,
     rng: np.random.Generator,
@@ -52,7 +52,7 @@ def survey_readings(
     progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
     blocked: Callable[[Array], NDArray[np.bool_]] | None = None,
     jobs: int | None = None,
-) -> Readings:
+) -> tuple[Readings, NDArray[np.bool_]]:
     """Readings of the robot at each node of a grid, in each heading.
 
     base_link stands on the node, so the magnetometer is beside it by its lever arm, turned with the heading.
@@ -79,32 +79,9 @@ def survey_readings(
             several threads.
 
     Returns:
-        A row for each node, in the order of `Grid.poses`, with magnitudes; `good` where the robot can stand.
+        A row for each node, in the order of `Grid.poses`, with magnitudes, `good` where the robot can stand;
+        and the nodes without a reading, shape (H, Y, X): lock was lost, or the node is blocked.
     """
-    about: dict[str, Any] = {"source": source, "licence": licence, "created": created}
-    about |= {"blocked": blocked, "jobs": jobs}
-    about |= {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}
-    return _visit(scene, rng, spacing_m, headings_rad, readings, height_m, progress, **about)[0]
-
-
-def _visit(
-    scene: Scene,
-    rng: np.random.Generator,
-    spacing_m: float = 0.25,
-    headings_rad: Sequence[float] = QUARTERS,
-    readings: int = 1,
-    height_m: float | None = None,
-    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
-    *,
-    heading_error_rad: float = 0.0,
-    position_error_m: float = 0.0,
-    source: str = "",
-    licence: str = "",
-    created: str = "",
-    blocked: Callable[[Array], NDArray[np.bool_]] | None = None,
-    jobs: int | None = None,
-) -> tuple[Readings, NDArray[np.bool_]]:
-    """The readings, and the nodes without one, shape (H, Y, X): lock was lost, or the node is blocked."""
     if not 1 <= readings <= MOST_READINGS:
         most = f" and at most {MOST_READINGS:,}" if readings > MOST_READINGS else ""
         raise InputError(f"readings must be at least 1{most}, got {readings!r}")
@@ -172,6 +149,11 @@ def _visit(
     return read, lost
 
 
+def survey_readings(scene: Scene, *, rng: np.random.Generator, **options: Any) -> Readings:
+    """The readings of `visit`, whose arguments these are."""
+    return visit(scene, rng=rng, **options)[0]
+
+
 def _at_nodes(
     scene: Scene, height_m: float | None, height: float, poses: tuple[Array, Array]
 ) -> tuple[Array, NDArray[np.bool_]]:
@@ -195,26 +177,19 @@ def survey(
     name: str | None = None,
     **options: Any,
 ) -> AnomalyMap:
-    """Map the lab as the robot would: the values at the nodes are those of `survey_readings`.
+    """Map the lab as the robot would: the values at the nodes are those of `visit`.
 
     The variance of a node is that of the sensor's noise and resolution, plus the mean square by which the
     field at the robot's actual pose differs from that at the node. Between nodes, the error of interpolation
     is estimated from the nodes (`magtwin.field.maps.curvature`).
 
-    Args:
-        scene: As for `survey_readings`.
-        rng: As for `survey_readings`.
-        readings: As for `survey_readings`.
-        heading_error_rad: As for `survey_readings`; the map takes each heading as the node's.
-        position_error_m: As for `survey_readings`.
-        name: Name of the map. Default: the scene's.
-        options: The other arguments of `survey_readings`.
+    Arguments are those of `visit`, and the map's name, by default the scene's.
 
     Returns:
         The map, with its variance. Nodes that are blocked or where lock was lost are not valid.
     """
     errors: dict[str, Any] = {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}
-    read, lost = _visit(scene, rng, readings=readings, **errors, **options)
+    read, lost = visit(scene, rng=rng, readings=readings, **errors, **options)
     assert read.grid is not None
     assert read.height_m is not None
     sensor, grid = scene.robot.magnetometer, read.grid

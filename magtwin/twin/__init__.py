@@ -22,7 +22,7 @@ _NAMES = {
     "opening": "check_scene lab_and_map led_by locate open_twin scene_file scene_of shipped_or twin_of",
     "robot_scene": "scene_with_robot",
     "robots": "simulate_robots",
-    "simulation": "engine_named path_metadata scan simulate",
+    "simulation": "engine_named scan simulate",
     "sweeps": "MIXTURE sweep",
     "session": "in_session in_session_of model_error_of room_of trained_on with_plant",
     "twin": "Kind Session Twin",

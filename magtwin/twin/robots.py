@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike
 from magtwin.errors import find
 from magtwin.path import Path
 from magtwin.run.run import Run
-from magtwin.sim.motion.drive_input import drive_input
+from magtwin.sim.motion.drive_input import drive_input, path_metadata
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.scene import Scene
 from magtwin.twin.opening import led_by
 from magtwin.twin.session import in_session, model_error_of, room_of, with_plant
-from magtwin.twin.simulation import check_commands, finished, path_metadata, predictor_of
+from magtwin.twin.simulation import check_commands, finished, predictor_of
 from magtwin.twin.twin import Kind, Session, Twin, checked_seed, opened, scene_sha256
 
 if TYPE_CHECKING:

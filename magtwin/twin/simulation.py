@@ -1,6 +1,5 @@
 """Simulate: a twin and a path become a Run."""
 
-import hashlib
 import importlib
 from collections.abc import Callable, Iterable
 from pathlib import Path as FilePath
@@ -13,7 +12,7 @@ from magtwin.errors import InputError, find
 from magtwin.path import Path
 from magtwin.report.verdict import OWN
 from magtwin.run.run import Run
-from magtwin.sim.motion.drive_input import drive_input
+from magtwin.sim.motion.drive_input import drive_input, path_metadata
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.scene import Scene
 from magtwin.twin.session import in_session, in_session_of, model_error_of, room_of, trained_on, with_plant
@@ -179,35 +178,15 @@ def engine_named(
     return engine
 
 
-def path_metadata(path: "Path | Commands | Run | str") -> Metadata:
-    """File and checksum of what was driven."""
-    if isinstance(path, str):
-        return {}
-    if isinstance(path, Run):
-        arrays: Iterable[NDArray[Any]] = (array for _, array in sorted(path.items()))
-        kind, file = "replay", ""
-    elif isinstance(path, Path):
-        arrays, kind, file = (path.p_xy, np.array([path.closed])), "path", path.file
-    else:
-        arrays, kind, file = (path.rows,), "commands", path.file
-    metadata: Metadata = {f"{kind}_file": file} if file else {}
-    if isinstance(path, Path) and path.placing:
-        metadata["path_placing"] = " ".join(map(repr, path.placing))
-    checksum = hashlib.sha256()
-    for array in arrays:
-        checksum.update(np.ascontiguousarray(array).tobytes())
-    return {**metadata, f"{kind}_sha256": checksum.hexdigest()}
-
-
 def finished(
     twin: Twin,
     run: Run,
-    path: "Path | Commands | Run | str | Metadata",
+    path: Metadata,
     read: "Read | None",
     *,
     seed: int,
     duration_s: float | None,
-    config_sha256: str | None = None,
+    config_sha256: str,
     add: bool = True,
 ) -> Run:
     """A run with the columns that its network adds and the metadata that reproduce it.
@@ -215,11 +194,11 @@ def finished(
     Args:
         twin: The twin in its session.
         run: What the simulator made.
-        path: What was driven, or what `path_metadata` gave for it.
+        path: What `path_metadata` gave for what was driven.
         read: What the network read. None without a network.
         seed: Seed of the run.
         duration_s: Duration that was asked for [s].
-        config_sha256: `scene_sha256` of the twin's scene, if it is known already.
+        config_sha256: `scene_sha256` of the twin's scene.
         add: Whether to add columns that the run lacks, or only replace those that it has.
     """
     if read is not None:
@@ -236,10 +215,8 @@ def finished(
         metadata["plant"] = OF_SCENE  # unless the twin's metadata name another
     if read is not None and read.intervals != OWN:
         metadata["network_intervals"] = read.intervals
-    driven = path if isinstance(path, dict) else path_metadata(path)
-    metadata |= dict(twin.session) | driven | dict(twin.metadata)
-    metadata["config_sha256"] = config_sha256 or scene_sha256(twin.scene)
-    return run.with_metadata(**metadata)
+    metadata |= dict(twin.session) | path | dict(twin.metadata)
+    return run.with_metadata(**{**metadata, "config_sha256": config_sha256})
 
 
 def check_commands(path: "Path | Commands | Run | str", network: "NeuralMagnetometer | None") -> None:

@@ -14,7 +14,7 @@ from magtwin.errors import InputError, RepairWarning
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.path import Path
 from magtwin.run.run import Run
-from magtwin.sim.motion.drive_input import drive_inputs
+from magtwin.sim.motion.drive_input import drive_inputs, path_metadata
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
@@ -192,7 +192,7 @@ class _Finish:
             if check:
                 self.check(run)
             options: Any = {"duration_s": self.duration_s, "config_sha256": config, "add": False}
-            runs.append(finished(own, run, job.path, read, seed=job.seed, **options))
+            runs.append(finished(own, run, path_metadata(job.path), read, seed=job.seed, **options))
         return runs
 
     def check(self, run: Run) -> None:

@@ -1,9 +1,12 @@
 """DriveInput: what a robot can be told to drive, from a name, a file, points, a path, commands or a run."""
 
+import hashlib
+from collections.abc import Iterable
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.path import Path, resolve_path
@@ -54,6 +57,26 @@ def drive_inputs(paths: Any, room: Room | None = None) -> DriveInput | list[Driv
         if key not in known:
             known[key] = drive_input(path, room)
     return [known[key] for key in keys]
+
+
+def path_metadata(path: DriveInput) -> dict[str, str | int | float | bool]:
+    """File and checksum of what was driven."""
+    if isinstance(path, str):
+        return {}
+    if isinstance(path, Run):
+        arrays: Iterable[NDArray[Any]] = (array for _, array in sorted(path.items()))
+        kind, file = "replay", ""
+    elif isinstance(path, Path):
+        arrays, kind, file = (path.p_xy, np.array([path.closed])), "path", path.file
+    else:
+        arrays, kind, file = (path.rows,), "commands", path.file
+    metadata: dict[str, str | int | float | bool] = {f"{kind}_file": file} if file else {}
+    if isinstance(path, Path) and path.placing:
+        metadata["path_placing"] = " ".join(map(repr, path.placing))
+    checksum = hashlib.sha256()
+    for array in arrays:
+        checksum.update(np.ascontiguousarray(array).tobytes())
+    return {**metadata, f"{kind}_sha256": checksum.hexdigest()}
 
 
 def _are_points(values: list[Any]) -> bool:

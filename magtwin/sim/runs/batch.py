@@ -17,12 +17,11 @@ from typing import Any, Protocol, overload
 import numpy as np
 
 from magtwin.errors import InputError, find
-from magtwin.path import Path
 from magtwin.report.summary import Summarized, Summary, listed
 from magtwin.run.run import COLUMNS, Run
 from magtwin.sim.motion.closed_loop import LOOPS, warm_up
 from magtwin.sim.motion.drive import Pose
-from magtwin.sim.motion.drive_input import DriveInput
+from magtwin.sim.motion.drive_input import DriveInput, path_metadata
 from magtwin.sim.motion.engine import Travel
 from magtwin.sim.runs.driving import Course, Metadata, Trip, course_of, drive, labelled
 from magtwin.sim.runs.sensing import Conditions, Sensing, streams
@@ -270,14 +269,5 @@ class Runs(Summarized, Sequence[Run]):
 
 def _content(path: DriveInput) -> str:
     """What is driven, as a text: a name, or a name with a checksum of the points, commands or columns."""
-    if isinstance(path, str):
-        return path
-    arrays = (
-        path.columns.values()
-        if isinstance(path, Run)
-        else (path.p_xy if isinstance(path, Path) else path.rows,)
-    )
-    total = hashlib.sha256()
-    for array in arrays:
-        total.update(np.ascontiguousarray(array).tobytes())
-    return f"{getattr(path, 'name', 'run')} {total.hexdigest()}"
+    sums = [value for name, value in path_metadata(path).items() if name.endswith("_sha256")]
+    return " ".join([path if isinstance(path, str) else getattr(path, "name", "run"), *map(str, sums)])

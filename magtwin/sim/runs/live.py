@@ -5,7 +5,8 @@ If `simulate` drives the same commands from the same seed, it gives the same col
 
 from array import array
 from collections.abc import Callable, Iterable
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,15 +16,14 @@ from magtwin.run.run import Run
 from magtwin.sim.motion.closed_loop import Chassis
 from magtwin.sim.motion.commands import Commands
 from magtwin.sim.motion.drive import Moment, draw_wheel_errors, moment_in_steps, wheel_rates
-from magtwin.sim.motion.follow import CONTROL_RATE_HZ, STAND, loop_by_commands
+from magtwin.sim.runs.driving import course_of
 from magtwin.sim.runs.neighbours import Neighbour
-from magtwin.sim.runs.sensing import Conditions, LidarMode, Sensing, streams
+from magtwin.sim.runs.sensing import Conditions, Sensing, streams
 from magtwin.sim.runs.simulate import check_run, run_metadata
 from magtwin.sim.sensors.clock import Samples
 from magtwin.sim.sensors.lidar import Scanner, Scans
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.spec.drive import DriveSpec
-from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
@@ -89,29 +89,19 @@ class LiveRobot:
         *,
         anomaly_map: AnomalyMap,
         rng: np.random.Generator,
-        obstacles: Obstacles | None = None,
-        rate_hz: float | None = None,
         network: Network | None = None,
         model_error: ModelError | None = None,
-        outside: Literal["nan", "clamp"] = "nan",
-        lidar: LidarMode = "schedule",
+        **options: Any,
     ) -> None:
-        """Put it at the scene's start, at rest."""
-        robot, obstacles = scene.robot, obstacles or Obstacles()
-        conditions = Conditions(
-            anomaly_map=anomaly_map,
-            network=network is not None,
-            rate_hz=rate_hz,
-            lidar=lidar,
-            outside=outside,
-        )
-        check_run(scene, Commands("live", np.zeros((1, 3))), conditions)
-        self.step_s = 1.0 / CONTROL_RATE_HZ
-        draws = streams(rng)
+        """Put it at the scene's start, at rest; `options` are those of `Conditions`."""
+        conditions = Conditions(anomaly_map=anomaly_map, network=network is not None, **options)
+        robot, obstacles, stand = scene.robot, conditions.obstacles, Commands("live", np.zeros((1, 3)))
+        check_run(scene, stand, conditions)
+        loop = course_of(scene, stand, 0.0, conditions).loop
+        assert loop is not None
+        self.step_s, draws = loop.dt, streams(rng)
         errors = draw_wheel_errors(robot.drive, draws["drive"])
-        radius = robot.footprint_radius_m
-        start: Any = {"start": scene.start, "footprint_radius_m": radius, "wheel_errors": errors}
-        self._chassis = Chassis(loop_by_commands(STAND, robot.drive, **start), obstacles)
+        self._chassis = Chassis(replace(loop, wheel_errors=errors), obstacles)
         self._track = Track(robot.drive, self.step_s, scene.start)
         self._network, self._model_error, self._height_m = network, model_error, robot.base_height_m
         self._robot, self._neighbours = robot, list[Neighbour]()

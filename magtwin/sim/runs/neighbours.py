@@ -57,9 +57,6 @@ class Approach:
     t_s: float
     """Time of the least distance [s]."""
 
-    p_xy: tuple[float, float]
-    """Place then, midway between them [m]."""
-
     meet_s: float | None
     """Time of their first overlap [s]; None if they never overlap."""
 
@@ -173,7 +170,6 @@ def approaches(travels: Mapping[str, Neighbour]) -> Iterator[Approach]:
                 names=(a, b),
                 clearance_m=float(apart[nearest]),
                 t_s=float(t[nearest]),
-                p_xy=(float(middle[nearest, 0]), float(middle[nearest, 1])),
                 meet_s=float(t[first]) if len(met) else None,
                 p_meet=(float(middle[first, 0]), float(middle[first, 1])),
             )
