@@ -10,16 +10,15 @@ from numpy.typing import ArrayLike
 from magtwin.errors import find
 from magtwin.path import Path
 from magtwin.run.run import Run
-from magtwin.sim.motion.drive_input import drive_input, path_metadata
+from magtwin.sim.motion.drive_input import drive_input
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.scene import Scene
 from magtwin.twin.opening import led_by
-from magtwin.twin.session import in_session, model_error_of, room_of, with_plant
-from magtwin.twin.simulation import check_commands, finished, predictor_of
-from magtwin.twin.twin import Kind, Session, Twin, checked_seed, opened, scene_sha256
+from magtwin.twin.session import in_session, room_of, with_plant
+from magtwin.twin.simulation import check_commands, finisher
+from magtwin.twin.twin import Kind, Session, Twin, checked_seed, opened
 
 if TYPE_CHECKING:
-    from magtwin.learn.inference.magnetometer import Read
     from magtwin.sim.motion.commands import Commands
 
 
@@ -95,15 +94,6 @@ def simulate_robots(
     }
     for name, path in driven.items():
         check_commands(path, twins[name].magnetometer)
-    reads: dict[str, list[Read]] = {name: [] for name in placed}
-    hashes = {name: scene_sha256(own.scene) for name, own in twins.items()}
-    paths_said = {name: path_metadata(path) for name, path in driven.items()}
-
-    def complete(name: str, block: Run) -> Run:
-        read = reads[name].pop() if reads[name] else None
-        known: Any = {"seed": seed, "duration_s": duration_s, "config_sha256": hashes[name]}
-        return finished(twins[name], block, paths_said[name], read, **known)
-
     runs = run_robots(
         twin.scene,
         driven,
@@ -116,11 +106,13 @@ def simulate_robots(
         rate_hz=rate_hz,
         obstacles=twin.obstacles,
         controller=controller,
-        disturbances_nt={name: predictor_of(own, reads[name]) for name, own in twins.items()},
-        model_errors={name: model_error_of(twins[name], seed, which=k) for k, name in enumerate(placed)},
+        networks=[name for name, own in twins.items() if own.magnetometer is not None],
+        finish={
+            name: finisher(twins[name], path, seed, duration_s, which=k)
+            for k, (name, path) in enumerate(driven.items())
+        },
         outside=outside,
         lidar=lidar,
-        complete=complete,
         progress=progress,
         each=each,
     )

@@ -12,7 +12,7 @@ from magtwin.errors import InputError, find
 from magtwin.path import Path
 from magtwin.report.verdict import OWN
 from magtwin.run.run import Run
-from magtwin.sim.motion.drive_input import drive_input, path_metadata
+from magtwin.sim.motion.drive_input import DriveInput, drive_input, path_metadata
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.scene import Scene
 from magtwin.twin.session import in_session, in_session_of, model_error_of, room_of, trained_on, with_plant
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from magtwin.sim.motion.commands import Commands
     from magtwin.sim.motion.controllers import Controller
     from magtwin.sim.motion.engine import Engine
-    from magtwin.sim.runs.simulate import Predict
+    from magtwin.sim.runs.simulate import Finish, Sensed
     from magtwin.sim.sensors.lidar import Scans
 
 
@@ -105,14 +105,6 @@ def simulate(
     check_field(twin.scene, twin.field)
     path = drive_input(path, room_of(twin))
     check_commands(path, twin.magnetometer)
-    reads: list[Read] = []
-    sha256, driven = scene_sha256(twin.scene), path_metadata(path)
-
-    def complete(block: Run) -> Run:
-        read = reads.pop() if reads else None
-        known: Any = {"seed": seed, "duration_s": duration_s, "config_sha256": sha256}
-        return finished(twin, block, driven, read, **known)
-
     run = run_scene(
         twin.scene,
         path,
@@ -121,8 +113,8 @@ def simulate(
         speed=speed,
         duration_s=duration_s,
         rate_hz=rate_hz,
-        disturbance_nt=predictor_of(twin, reads),
-        model_error=model_error_of(twin, seed),
+        network=twin.magnetometer is not None,
+        finish=finisher(twin, path, seed, duration_s),
         outside=outside,
         lidar=lidar,
         obstacles=twin.obstacles,
@@ -130,7 +122,6 @@ def simulate(
         engine=engine_named(engine, twin, progress=progress) if isinstance(engine, str) else engine,
         sensors=sensors,
         interference=interference,
-        complete=complete,
         progress=progress,
         each=each,
     )
@@ -232,15 +223,18 @@ def check_commands(path: "Path | Commands | Run | str", network: "NeuralMagnetom
             )
 
 
-def predictor_of(twin: Twin, reads: "list[Read]") -> "Predict | None":
-    """A function that predicts the disturbance of a run and appends what the network read to `reads`."""
-    network, known = twin.magnetometer, [trained_on(twin)]
-    if network is None:
-        return None
+def finisher(
+    twin: Twin, path: DriveInput, seed: int, duration_s: float | None, *, which: int = 0
+) -> "Finish":
+    """What makes whole runs of those that a twin's robot has sensed; `which` is its place in the scene."""
+    network, error = twin.magnetometer, model_error_of(twin, seed, which=which)
+    known: Any = {"seed": seed, "duration_s": duration_s, "config_sha256": scene_sha256(twin.scene)}
+    driven, trained = path_metadata(path), trained_on(twin)
 
-    def predict(run: Run) -> tuple[NDArray[Any], NDArray[Any]]:
-        (read,) = network.read([run], known=known)
-        reads.append(read)
-        return read.disturbance_nt, read.sd_nt
+    def finish(sensed: "Sensed") -> Run:
+        if network is None:
+            return finished(twin, sensed.read(), driven, None, **known)
+        (read,) = network.read([sensed.run], known=[trained])
+        return finished(twin, sensed.read((read.disturbance_nt, read.sd_nt), error), driven, read, **known)
 
-    return predict
+    return finish

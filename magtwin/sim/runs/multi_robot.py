@@ -8,6 +8,7 @@ own.
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -19,8 +20,7 @@ from magtwin.sim.motion.drive_input import DriveInput
 from magtwin.sim.runs.driving import Trip, course_of, drive, labelled
 from magtwin.sim.runs.neighbours import Approach, Neighbour, approaches
 from magtwin.sim.runs.sensing import Conditions, Sensing, streams
-from magtwin.sim.runs.simulate import Predict, Sensed, check_run, read_all
-from magtwin.sim.sensors.model_error import ModelError
+from magtwin.sim.runs.simulate import Finish, Sensed, check_run, read_all
 from magtwin.spec.scene import Scene
 
 
@@ -33,9 +33,8 @@ def simulate_robots(
     wanted: Collection[str] | None = None,
     meet: Literal["refuse", "flag"] = "refuse",
     speed: float = 0.2,
-    disturbances_nt: Mapping[str, Predict | None] | None = None,
-    model_errors: Mapping[str, ModelError | None] | None = None,
-    complete: Callable[[str, Run], Run] = lambda name, block: block,
+    finish: Mapping[str, Finish] = MappingProxyType({}),
+    networks: Collection[str] = (),
     progress: Callable[[int, int, str], Any] | None = None,
     each: Callable[[str, Run], Any] | None = None,
     **options: Any,
@@ -44,9 +43,10 @@ def simulate_robots(
 
     A robot's Run is that of `simulate` in `scene.led_by(name)` with the same generator, except for the
     field of the others at its magnetometer, and the bumps. Arguments are those of `simulate`, by the robot's
-    name where robots differ. `paths` is what each drives: robots without a path are absent. `wanted` names
-    those whose sensors are read; the others drive nevertheless. `meet` is what happens if footprints overlap:
-    "refuse" names time and place, "flag" sets flag_bump in both Runs while they drive through each other.
+    name where robots differ; `networks` are the robots that have one. `paths` is what each drives: robots
+    without a path are absent. `wanted` names those whose sensors are read; the others drive nevertheless.
+    `meet` is what happens if footprints overlap: "refuse" names time and place, "flag" sets flag_bump in both
+    Runs while they drive through each other.
 
     Returns:
         A Run for each wanted robot, by name. Its metadata name the robot, and the robot that came nearest,
@@ -55,10 +55,9 @@ def simulate_robots(
     if not paths:
         raise InputError("no robot is to drive; name one at least", parameter="paths")
     find("way of robots to meet", meet, {"refuse": None, "flag": None})
-    predicts = {name: (disturbances_nt or {}).get(name) for name in paths}
     led = {name: scene.led_by(name) for name in paths}
     common = Conditions(anomaly_map=anomaly_map, network=False, **options)
-    conditions = {name: replace(common, network=predicts[name] is not None) for name in paths}
+    conditions = {name: replace(common, network=name in networks) for name in paths}
     trips = []
     for name, path in paths.items():
         with labelled(f"robot {name!r}"):
@@ -78,8 +77,8 @@ def simulate_robots(
         about = {"robot": name, **_nearest(name, near)}
 
         def read(sensed: Sensed, name: str = name, about: Mapping[str, Any] = about) -> Run:
-            run = sensed.predicted(predicts[name], (model_errors or {}).get(name))
-            return complete(name, run.with_metadata(**about))
+            told = replace(sensed, run=sensed.run.with_metadata(**about))
+            return finish.get(name, Sensed.read)(told)
 
         runs[name] = read_all(
             Sensing(led[name], trip.draws, conditions[name], neighbours=others),

@@ -42,6 +42,35 @@ MOST_READINGS = 20_000_000
 """Most readings of a run: about 12 GB of columns on the disk."""
 
 
+@dataclass(frozen=True, eq=False)
+class Sensed:
+    """A run in which all sensors but the magnetometer's scalar have been read."""
+
+    run: Run
+    """Every column but those that depend on the disturbance."""
+
+    sensing: Sensing
+    """The sensors."""
+
+    @property
+    def wanted(self) -> frozenset[str]:
+        """Columns of `COLUMNS` that the whole run has."""
+        return self.sensing.wanted
+
+    def read(self, predicted: Predicted | None = None, model_error: ModelError | None = None) -> Run:
+        """Read the magnetometer, once; returns the whole run. Arguments as for `Sensing.read`."""
+        columns = self.sensing.read(self.run.columns, predicted, model_error)
+        return Run(columns, self.run.metadata, self.sensing.specs)
+
+    def predicted(self, predict: Predict, model_error: ModelError | None = None) -> Run:
+        """Read the magnetometer with what a network predicts of the other columns."""
+        return self.read(predict(self.run), model_error)
+
+
+Finish = Callable[[Sensed], Run]
+"""Makes a whole run, or a block of a long one, in which all but the magnetometer has been read."""
+
+
 def simulate(
     scene: Scene,
     path: DriveInput,
@@ -49,11 +78,10 @@ def simulate(
     anomaly_map: AnomalyMap,
     rng: np.random.Generator,
     speed: float = 0.2,
-    disturbance_nt: Predict | None = None,
-    model_error: ModelError | None = None,
+    network: bool = False,
+    finish: Finish = Sensed.read,
     sensors: Iterable[str | SensorFactory] = (),
     interference: Iterable[str | Interference] = (),
-    complete: Callable[[Run], Run] = lambda block: block,
     progress: Callable[[int, int, str], Any] | None = None,
     each: Callable[[Run], Any] | None = None,
     **options: Any,
@@ -61,8 +89,8 @@ def simulate(
     """Drive a scene's robot along a path and read its sensors; see `magtwin.twin.simulation.simulate`.
 
     b_total = b_map + b_disturbance with b_map at base_link's pose, and b_measured = b_total + b_model_error +
-    b_noise. The disturbance depends on the kind of the magnetometer. A neural one takes what `disturbance_nt`
-    predicts. A physical one takes b_truth - b_map: the exact field of the lab and of the robot at the
+    b_noise. The disturbance depends on the kind of the magnetometer. A neural one takes what `finish`
+    gives it. A physical one takes b_truth - b_map: the exact field of the lab and of the robot at the
     magnetometer, less the map. One of the kind "map-only" has none. `magtwin.sim.exact` defines the exact
     field. If Earth and sources make it, b_truth and b_vector are given for all kinds; if the map does, for a
     physical magnetometer only.
@@ -75,32 +103,27 @@ def simulate(
         anomaly_map: The map of `scene.map_layer`.
         rng: Source of all noise.
         speed: Forward speed on straight parts of the path [m/s].
-        disturbance_nt: From a Run with all other sensors, the vector axes too, to the disturbance of each
-            reading [nT], shape (N,), alone or with the standard deviation of its error. Called once, or for
-            each block of a long run.
-        model_error: Statistics of that error; None draws no error.
+        network: Whether a network predicts the disturbance.
+        finish: Reads the magnetometer of the run, or of each block of a long one, with what a network
+            predicts for it, and returns it as it is to be kept; see `Sensed`.
         sensors: Custom sensors: names or factories; see `magtwin.sim.extensions`.
         interference: Custom terms of the field at the magnetometer: names or functions.
-        complete: Called with the run, or with each block of a long one; returns it as it is to be kept.
         progress: Called with readings made, readings in all and the simulated time as text, in a long run.
-        each: Called with each block of a long run, as `complete` gave it.
+        each: Called with each block of a long run, as `finish` gave it.
         options: The fields of `Conditions` that have a default.
 
     Returns:
         A Run with every column of `COLUMNS`, in their order. `b_sd_nt` is nan and `flag_out_of_distribution`
         is false, because both depend on the network.
     """
-    conditions = Conditions(anomaly_map=anomaly_map, network=disturbance_nt is not None, **options)
+    conditions = Conditions(anomaly_map=anomaly_map, network=network, **options)
     check_run(scene, path, conditions)
     draws = streams(rng)
     sensing = Sensing(scene, draws, conditions, sensors=sensors, interference=interference)
     course = course_of(scene, path, speed, conditions)
     (motion,) = drive([Trip(scene, course, draws)], conditions)
 
-    def read(sensed: Sensed) -> Run:
-        return complete(sensed.predicted(disturbance_nt, model_error))
-
-    return read_all(sensing, motion, course.metadata, read, progress=progress, each=each)
+    return read_all(sensing, motion, course.metadata, finish, progress=progress, each=each)
 
 
 def check_run(scene: Scene, path: DriveInput, conditions: Conditions) -> None:
@@ -123,31 +146,6 @@ def check_run(scene: Scene, path: DriveInput, conditions: Conditions) -> None:
         _check_readings(conditions.duration_s, rate)
 
 
-@dataclass(frozen=True, eq=False)
-class Sensed:
-    """A run in which all sensors but the magnetometer's scalar have been read."""
-
-    run: Run
-    """Every column but those that depend on the disturbance."""
-
-    sensing: Sensing
-    """The sensors."""
-
-    @property
-    def wanted(self) -> frozenset[str]:
-        """Columns of `COLUMNS` that the whole run has."""
-        return self.sensing.wanted
-
-    def read(self, predicted: Predicted | None = None, model_error: ModelError | None = None) -> Run:
-        """Read the magnetometer, once; returns the whole run. Arguments as for `Sensing.read`."""
-        columns = self.sensing.read(self.run.columns, predicted, model_error)
-        return Run(columns, self.run.metadata, self.sensing.specs)
-
-    def predicted(self, predict: Predict | None, model_error: ModelError | None) -> Run:
-        """Read the magnetometer with what a network predicts of the other columns."""
-        return self.read(None if predict is None else predict(self.run), model_error)
-
-
 def sense_all(sensing: Sensing, motion: Travel, metadata: Mapping[str, str | int | float | bool]) -> Sensed:
     """Read the sensors of a whole run."""
     count, known = readings(sensing, motion, metadata)
@@ -159,7 +157,7 @@ def read_all(
     sensing: Sensing,
     motion: Travel,
     metadata: Mapping[str, str | int | float | bool],
-    read: Callable[[Sensed], Run],
+    finish: Finish,
     *,
     progress: Callable[[int, int, str], Any] | None = None,
     each: Callable[[Run], Any] | None = None,
@@ -169,7 +167,7 @@ def read_all(
     whole, rows = Spool(count), sensing.rows_at_once(count)
     for first in range(0, count, rows):
         t = np.arange(first, min(first + rows, count)) / sensing.rate_hz
-        block = read(Sensed(Run(sensing.sense(motion, t), known, sensing.specs), sensing))
+        block = finish(Sensed(Run(sensing.sense(motion, t), known, sensing.specs), sensing))
         whole.append(block)
         if rows == count:
             break

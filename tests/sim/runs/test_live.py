@@ -75,8 +75,8 @@ def test_commands_that_come_one_by_one_give_the_columns_of_a_run_of_them(twin: T
         obstacles=twin.obstacles,
         duration_s=DURATION_S,
         lidar="on",
-        disturbance_nt=disturbance_nt if twin.magnetometer else None,
-        model_error=ERROR,
+        network=twin.magnetometer is not None,
+        finish=lambda sensed: sensed.predicted(disturbance_nt, ERROR) if twin.magnetometer else sensed.read(),
     )
     assert np.ptp(run["p_world_base"][:, 0]) > 0.3
     assert (run["v_base"][:, 0] == 0).sum() > 50

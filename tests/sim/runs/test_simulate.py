@@ -59,7 +59,9 @@ MAP = wavy_map()
 FLAT = dataclasses.replace(MAP, values_nt=np.full((4, 15, 25), 41_000.0))
 
 
-def drive(scene: Scene = KNOWN, path: Path = LINE, *, seed: int = 0, **options) -> Run:
+def drive(scene: Scene = KNOWN, path: Path = LINE, *, seed: int = 0, disturbance_nt=None, **options) -> Run:
+    if disturbance_nt is not None:
+        options |= {"network": True, "finish": lambda sensed: sensed.predicted(disturbance_nt)}
     options.setdefault("anomaly_map", MAP)
     return simulate(scene, path, rng=np.random.default_rng(seed), **options)
 
