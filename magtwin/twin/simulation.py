@@ -169,6 +169,18 @@ def engine_named(
     return engine
 
 
+def stated(twin: Twin, run: Run, read: "Read | None", *, add: bool = True) -> Run:
+    """A run with what its network states of each reading; `add`: columns that the run lacks, too."""
+    if read is None:
+        return run
+    spec = twin.scene.robot.magnetometer
+    noise = spec.noise_density_nt * np.sqrt(float(run.metadata["rate_hz"]) / 2)
+    columns: dict[str, NDArray[Any]] = {"b_sd_nt": np.hypot(read.stated_sd_nt, noise)}
+    if read.outside is not None:
+        columns["flag_out_of_distribution"] = read.outside
+    return run.with_columns(**{name: array for name, array in columns.items() if add or name in run})
+
+
 def finished(
     twin: Twin,
     run: Run,
@@ -178,9 +190,8 @@ def finished(
     seed: int,
     duration_s: float | None,
     config_sha256: str,
-    add: bool = True,
 ) -> Run:
-    """A run with the columns that its network adds and the metadata that reproduce it.
+    """A run with the metadata that reproduce it.
 
     Args:
         twin: The twin in its session.
@@ -190,15 +201,7 @@ def finished(
         seed: Seed of the run.
         duration_s: Duration that was asked for [s].
         config_sha256: `scene_sha256` of the twin's scene.
-        add: Whether to add columns that the run lacks, or only replace those that it has.
     """
-    if read is not None:
-        spec = twin.scene.robot.magnetometer
-        noise = spec.noise_density_nt * np.sqrt(float(run.metadata["rate_hz"]) / 2)
-        columns: dict[str, NDArray[Any]] = {"b_sd_nt": np.hypot(read.stated_sd_nt, noise)}
-        if read.outside is not None:
-            columns["flag_out_of_distribution"] = read.outside
-        run = run.with_columns(**{name: array for name, array in columns.items() if add or name in run})
     metadata: Metadata = {"magtwin": __version__, "numpy": np.__version__, "seed": seed}
     if duration_s is not None:
         metadata["asked_duration_s"] = float(duration_s)
@@ -223,18 +226,34 @@ def check_commands(path: "Path | Commands | Run | str", network: "NeuralMagnetom
             )
 
 
+def reader(twin: Twin, seed: int, *, which: int = 0) -> "Callable[[Sensed], tuple[Run, Read | None]]":
+    """What reads the magnetometer of runs, or of blocks, in which all else has been sensed.
+
+    `which` is the place of the robot in its scene.
+    """
+    network, trained = twin.magnetometer, trained_on(twin)
+    error = model_error_of(twin, seed, which=which)
+
+    def read_in(sensed: "Sensed") -> tuple[Run, "Read | None"]:
+        if network is None:
+            return sensed.read(), None
+        if not sensed.run.rows:
+            return sensed.read((np.zeros(0), np.zeros(0)), error), None
+        (read,) = network.read([sensed.run], known=[trained])
+        return stated(twin, sensed.read((read.disturbance_nt, read.sd_nt), error), read), read
+
+    return read_in
+
+
 def finisher(
     twin: Twin, path: DriveInput, seed: int, duration_s: float | None, *, which: int = 0
 ) -> "Finish":
-    """What makes whole runs of those that a twin's robot has sensed; `which` is its place in the scene."""
-    network, error = twin.magnetometer, model_error_of(twin, seed, which=which)
+    """What makes whole runs of those that a twin's robot has sensed; `which` as for `reader`."""
+    read_in, driven = reader(twin, seed, which=which), path_metadata(path)
     known: Any = {"seed": seed, "duration_s": duration_s, "config_sha256": scene_sha256(twin.scene)}
-    driven, trained = path_metadata(path), trained_on(twin)
 
     def finish(sensed: "Sensed") -> Run:
-        if network is None:
-            return finished(twin, sensed.read(), driven, None, **known)
-        (read,) = network.read([sensed.run], known=[trained])
-        return finished(twin, sensed.read((read.disturbance_nt, read.sd_nt), error), driven, read, **known)
+        run, read = read_in(sensed)
+        return finished(twin, run, driven, read, **known)
 
     return finish

@@ -19,7 +19,7 @@ from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.twin.session import in_session, model_error_of, room_of, trained_on, with_plant
-from magtwin.twin.simulation import check_commands, finished
+from magtwin.twin.simulation import check_commands, finished, stated
 from magtwin.twin.twin import Kind, Twin, checked_seed, opened, scene_sha256, without_model_error
 
 if TYPE_CHECKING:
@@ -191,7 +191,8 @@ class _Finish:
             )
             if check:
                 self.check(run)
-            options: Any = {"duration_s": self.duration_s, "config_sha256": config, "add": False}
+            options: Any = {"duration_s": self.duration_s, "config_sha256": config}
+            run = stated(own, run, read, add=False)
             runs.append(finished(own, run, path_metadata(job.path), read, seed=job.seed, **options))
         return runs
 

@@ -10,12 +10,13 @@ from magtwin.run.run import Run
 from magtwin.sim.runs.live import LiveRobot
 from magtwin.sim.runs.multi_robot import simulate_robots
 from magtwin.sim.runs.sensing import streams
-from magtwin.sim.runs.simulate import simulate
+from magtwin.sim.runs.simulate import Sensed, simulate
 from magtwin.sim.sensors.lidar import scans_of
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.sim.session import draw_session
 from magtwin.spec.scene import PlacedRobot
 from magtwin.twin import Twin, open_twin
+from magtwin.twin.simulation import stated
 
 SEED = 3
 DURATION_S = 8.0
@@ -37,18 +38,20 @@ def twin(request: pytest.FixtureRequest, lab_scene: Path) -> Twin:
 def live_of(twin: Twin) -> LiveRobot:
     net = twin.magnetometer
 
-    def network(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray]:
-        assert net is not None
-        (read,) = net.read([run])
-        return read.disturbance_nt, read.sd_nt, read.outside, read.stated_sd_nt
+    def finish(sensed: Sensed) -> Run:
+        if net is None:
+            return sensed.read()
+        (read,) = net.read([sensed.run])
+        run = sensed.read((read.disturbance_nt, read.sd_nt), ERROR)
+        return stated(twin, run, read)
 
     return LiveRobot(
         twin.scene,
         anomaly_map=twin.field,
         rng=np.random.default_rng(SEED),
         obstacles=twin.obstacles,
-        network=network if net else None,
-        model_error=ERROR,
+        network=net is not None,
+        finish=finish,
         lidar="on",
     )
 
