@@ -20,13 +20,11 @@ from magtwin.errors import InputError, find
 from magtwin.report.summary import Summarized, Summary, listed
 from magtwin.run.run import COLUMNS, Run
 from magtwin.sim.motion.closed_loop import LOOPS, warm_up
-from magtwin.sim.motion.drive import Pose
 from magtwin.sim.motion.drive_input import DriveInput, path_metadata
 from magtwin.sim.motion.engine import Travel
 from magtwin.sim.runs.driving import Course, Metadata, Trip, course_of, drive, labelled
 from magtwin.sim.runs.sensing import Conditions, Sensing, streams
 from magtwin.sim.runs.simulate import Sensed, check_run, read_all, readings, sense_all
-from magtwin.spec.drive import DriveSpec
 from magtwin.spec.scene import Scene
 
 BLOCK = 16
@@ -107,7 +105,7 @@ class Runs(Summarized, Sequence[Run]):
         self._columns = frozenset(COLUMNS if columns is None else {"t", *columns})
         for name in sorted(self._columns):
             find("column", name, COLUMNS)
-        self._planned: dict[tuple[DriveInput | int, float, DriveSpec, float, Pose], Course] = {}
+        self._planned: dict[Any, Course] = {}
         self._kept, self._steps = 0, 0  # bytes of plans, and expected steps
         checked = set()
         for i, job in enumerate(jobs):
@@ -236,8 +234,9 @@ class Runs(Summarized, Sequence[Run]):
             odometry_scale=(1.0, 1.0),
             odometry_noise_std=0.0,
         )
-        path = id(job.path) if isinstance(job.path, Run) else job.path
-        key = (path, job.speed, alike, robot.footprint_radius_m, job.scene.start)
+        if isinstance(job.path, Run):
+            return course_of(job.scene, job.path, job.speed, self._conditions)
+        key = (job.path, job.speed, alike, robot.footprint_radius_m, job.scene.start)
         if key in self._planned:
             return self._planned[key]
         if self._kept > PLANNED:
