@@ -210,10 +210,6 @@ def turning_iron_nt(robot: RobotSpec, wheel_angle: ArrayLike) -> Array:
     moment points up at the angle 0 and forwards a quarter turn later. The caster rolls straight on, by the
     mean distance of the wheels; that its axis turns on curves is neglected.
 
-    Args:
-        robot: Its platform, drive and magnetometer.
-        wheel_angle: Angles turned by the left and right wheel since the start [rad], shape (N, 2).
-
     Returns:
         Field in base_link axes [nT], shape (N, 3).
     """
@@ -313,15 +309,7 @@ def own_field_nt(
 ) -> Array:
     """The field at the magnetometer of a robot that drives, from the ambient field there, without its plant.
 
-    Args:
-        robot: The robot.
-        motion: What it did.
-        t: Times of the readings [s], shape (N,).
-        b_base: Ambient field in base_link axes [nT], shape (N, 3).
-        b_rate: Its rate of change in base_link axes [nT/s], shape (N, 3).
-        true: The motion at these times.
-        lidar_on: Whether the LiDAR spins, shape (N,).
-        supply_a: Current drawn from the battery [A], shape (N,).
+    Arrays have a row for each of N readings at times t; `true` is the motion at these times.
 
     Returns:
         Field in base_link axes [nT], shape (N, 3).

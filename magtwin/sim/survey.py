@@ -232,13 +232,6 @@ def pose_error_nt2(
     2 n^2 + 1 points for n errors), which is exact for a parabola. The vector field around a node is the same
     for all headings: quadratic in x and y, through 3 x 3 points.
 
-    Args:
-        scene: A scene whose Earth's field is known.
-        grid: The nodes.
-        height_m: Height of the magnetometer above the floor [m].
-        heading_error_rad: Standard deviation of the heading [rad].
-        position_error_m: Standard deviation of the place, along x and y [m].
-
     Returns:
         Mean square [nT^2], shape (H, Y, X).
     """

@@ -45,12 +45,6 @@ def advance(pose: ArrayLike, v: ArrayLike, w: ArrayLike, duration: ArrayLike) ->
 def integrate_twist(v: ArrayLike, w: ArrayLike, dt: float, pose0: Pose = (0.0, 0.0, 0.0)) -> Array:
     """Poses of a unicycle under piecewise constant twists; each step as in `advance`.
 
-    Args:
-        v: Forward speeds [m/s], shape (K,).
-        w: Yaw rates [rad/s], shape (K,).
-        dt: Length of a step [s].
-        pose0: First x [m], y [m], yaw [rad] in world.
-
     Returns:
         x, y, yaw at the start and after each step, shape (K + 1, 3).
     """

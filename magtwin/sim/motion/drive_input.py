@@ -21,12 +21,8 @@ DriveInput = Path | Commands | Run | str
 def drive_input(path: Any, room: Room | None = None, *, fit: bool = False) -> DriveInput:
     """Resolve the `path` argument of `magtwin.simulate`.
 
-    Args:
-        path: The name of a path, a CSV file, or points (N, 2) [m], which become a `Path`. "random", a `Path`,
-            `Commands` and a `Run` stay as they are.
-        room: Where it is driven: named paths are scaled to its floor, see `magtwin.path.path_in`.
-            Default: the floor for which they were designed.
-        fit: Whether a path that does not fit into the room is moved and shrunk until it does.
+    Names, CSV files and points become a `Path`. Named paths are scaled to the floor of a room, and `fit` moves
+    and shrinks any path until it is clear of what stands there.
     """
     if isinstance(path, Commands | Run) or (isinstance(path, str) and path == "random"):
         return path

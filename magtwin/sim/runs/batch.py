@@ -88,15 +88,7 @@ class Runs(Summarized, Sequence[Run]):
         columns: Iterable[str] | None = None,
         block: int = BLOCK,
     ) -> None:
-        """Check every job; nothing is driven yet.
-
-        Args:
-            jobs: The runs, at least one.
-            conditions: What they have in common; the engine is the kinematic one.
-            finish: Makes whole runs of sensed ones.
-            columns: Columns to keep beside t. Default: all.
-            block: Runs made at a time.
-        """
+        """Check every job; nothing is driven yet."""
         if not jobs:
             raise InputError("no runs are asked for; give a seed for each")
         if not isinstance(block, int) or block < 1:

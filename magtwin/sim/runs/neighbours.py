@@ -106,14 +106,6 @@ def neighbours_field_nt(
     (1 + S) b + E db/dt with their field b in base_link axes: the robot's soft iron and eddy currents respond
     to it as to the lab's field.
 
-    Args:
-        scene: A scene whose Earth's field is known; its first robot has the magnetometer.
-        neighbours: The other robots.
-        motion: What the first robot did.
-        t: Times of the readings, ascending [s], shape (N,).
-        true: Its motion at these times.
-        until_s: Time up to which the motions are known [s].
-
     Returns:
         Field in base_link axes [nT], shape (N, 3).
     """

@@ -119,17 +119,9 @@ class Sensing:
     ) -> None:
         """Switch the sensors on.
 
-        A column that is neither wanted nor an input of the network is not computed.
-
-        Args:
-            scene: Lab, robot and sensors.
-            draws: What `streams` gave.
-            conditions: Map, rate, LiDAR, and whether there is a network.
-            wanted: Columns of `COLUMNS` that the run is to have.
-            neighbours: Other robots in the lab. The magnetometer reads their iron if the Earth's field is
-                known; it is added to what a network predicts.
-            sensors: Custom sensors; see `magtwin.sim.extensions`.
-            interference: Custom interference terms, added like the iron of neighbours.
+        A column that is neither wanted nor an input of the network is not computed. The magnetometer reads
+        the iron of neighbours if the Earth's field is known; like custom interference, it is added to what a
+        network predicts.
         """
         robot = scene.robot
         spec = robot.magnetometer

@@ -138,15 +138,7 @@ class SteppedRobots:
         rngs: Sequence[np.random.Generator],
         robots: Sequence[RobotSpec] | None = None,
     ) -> None:
-        """Place robots at rest, with the draws of a new run; the others stay as they are.
-
-        Args:
-            which: Numbers of the robots.
-            poses: x [m], y [m], yaw [rad] in world of each.
-            rngs: Source of all noise of each until it begins again.
-            robots: The scene's robot in the session of each, as `magtwin.sim.session.draw_session` gives it.
-                Default: the scene's robot.
-        """
+        """Place robots at rest, with the draws of a new run; the others stay as they are."""
         sessions = [self.scene.robot] * len(which) if robots is None else robots
         for i, pose, rng, robot in zip(which, poses, rngs, sessions, strict=True):
             draws = streams(rng)

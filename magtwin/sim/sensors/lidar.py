@@ -136,13 +136,7 @@ class Scanner:
         poses: Callable[[Array], Array],
         lidar_on: Callable[[Array], NDArray[np.bool_]],
     ) -> Scans:
-        """The scans whose time comes before `until_s`, with the times at which they arrive.
-
-        Args:
-            until_s: End of the time [s].
-            poses: From times [s] to x [m], y [m], height [m], yaw [rad] of base_link, shape (N, 4).
-            lidar_on: From times [s] to whether the LiDAR spins.
-        """
+        """The scans whose time comes before `until_s`, with the times at which they arrive."""
         spec, robot = self._robot.lidar, self._robot
         last = int(np.ceil((until_s - self._begin_s) * spec.scan_rate_hz - 1e-9))
         stamps = self._begin_s + np.arange(self._next, max(last, self._next)) / spec.scan_rate_hz

@@ -239,13 +239,6 @@ def stuck_nt(
 ) -> Array:
     """The value at which readings are stuck, drawn anew each time that lock is lost.
 
-    Args:
-        spec: Its mean and spread.
-        lost: Whether lock is lost, in the order of time, shape (N,).
-        rng: Source of the values.
-        was_lost: Whether lock was lost before the first.
-        before: The value then [nT].
-
     Returns:
         Readings [nT], shape (N,); meaningful if lock is lost.
     """
