@@ -21,8 +21,8 @@ DriveInput = Path | Commands | Run | str
 def drive_input(path: Any, room: Room | None = None, *, fit: bool = False) -> DriveInput:
     """Resolve the `path` argument of `magtwin.simulate`.
 
-    Names, CSV files and points become a `Path`. Named paths are scaled to the floor of a room, and `fit` moves
-    and shrinks any path until it is clear of what stands there.
+    Names, CSV files and points become a `Path`. Named paths are scaled to the floor of a room, and `fit`
+    moves and shrinks any path until it is clear of what stands there.
     """
     if isinstance(path, Commands | Run) or (isinstance(path, str) and path == "random"):
         return path
