@@ -6,7 +6,6 @@
 A file counts if one of its functions runs. Code that runs when a module is loaded does not count.
 """
 
-import contextlib
 import re
 import sys
 import tempfile
@@ -31,7 +30,7 @@ FILES = {
 """Most files of each walk."""
 
 OPTIMIZED = 1
-"""Flag of the code of functions (`inspect.CO_OPTIMIZED`)."""
+"""Flag of the code of functions, which bodies of modules and classes lack (`inspect.CO_OPTIMIZED`)."""
 
 
 def scene_to_recording(folder: Path) -> Iterator[None]:
@@ -98,7 +97,7 @@ def entered(walk: Callable[[Path], Iterator[None]]) -> set[str]:
     seen: set[str] = set()
 
     def note(frame: FrameType, event: str, _: Any) -> None:
-        if event == "call" and frame.f_code.co_flags & OPTIMIZED:  # a function, not the body of a module or class
+        if event == "call" and frame.f_code.co_flags & OPTIMIZED:
             seen.add(frame.f_code.co_filename)
 
     with tempfile.TemporaryDirectory() as folder:

@@ -24,8 +24,9 @@ from magtwin.field.maps.lookup import warm_up
 from magtwin.field.survey.stuck import mask_stuck
 from magtwin.files.file import shipped
 from magtwin.report.verdict import Z_90
+from magtwin.sim.at_rest import field_at_rest_nt
 from magtwin.sim.interference import ambient_field_nt
-from magtwin.sim.survey import blocked_by, field_at_rest_nt, survey_readings
+from magtwin.sim.survey import blocked_by, survey_readings
 from magtwin.usd.lab.obstacles import read_obstacles
 from magtwin.usd.scene import read_scene
 

@@ -53,7 +53,7 @@ def magtwins() -> dict[str, Callable[[], int]]:
     import numpy as np
 
     from magtwin.path import path_named
-    from magtwin.sim.motion import closed_loop, loop
+    from magtwin.sim.motion import closed_loop
     from magtwin.sim.motion.follow import loop_along
     from magtwin.spec.drive import DriveSpec
 
@@ -71,15 +71,10 @@ def magtwins() -> dict[str, Callable[[], int]]:
         )
 
     once = planned()
-    guide, figures, fence = once.guide, np.array([once.figures()]), closed_loop.fence_of(room)
-    record, made = np.zeros((1, loop.RECORD, COUNT)), np.zeros(1, np.int64)
-    laws, begin, end = np.array([guide.law]), np.array([0]), np.array([guide.table.shape[1]])
+    code, only = closed_loop.LOOPS.open(), np.zeros(1, np.intp)
 
     def steps() -> int:
-        state = np.array([once.state()])
-        closed_loop.LOOPS.open().robots(
-            laws, figures, guide.table, begin, end, *fence, state, 0, COUNT, record, made
-        )
+        record, made = closed_loop.Robots([once], room).step(0, COUNT, only, code=code)
         if made[0] != COUNT or record[0, -1].any():
             sys.exit("magtwin's robot did not drive for the whole time")
         return COUNT

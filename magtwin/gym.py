@@ -27,10 +27,9 @@ from magtwin.sim.motion.drive_input import drive_input
 from magtwin.sim.runs.simulate import Predict
 from magtwin.sim.runs.stepped import SENSED, SteppedRobots
 from magtwin.sim.session import draw_session
-from magtwin.spec.plant import PlantSpec
 from magtwin.spec.scene import Scene
-from magtwin.twin import Kind, Twin, room_of, with_plant
-from magtwin.twin.opening import opened
+from magtwin.twin import Kind, Twin, room_of
+from magtwin.twin.twin import opened
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer
@@ -132,7 +131,6 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         end_on_bump: bool = False,
         random_start: bool = False,
         session: Literal["drawn", "survey"] = "drawn",
-        plant: PlantSpec | str | None = None,
         render_mode: None = None,
     ) -> None:
         """Open a scene for several robots.
@@ -155,7 +153,6 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
             session: "drawn": each episode is a new session, from `magtwin.sim.session.draw_session`: charge,
                 IMU zero, LiDAR's phase, wheels, odometry and the robot's own field. "survey": the robot as
                 in the survey of the map. A Twin that is in a session stays in it.
-            plant: As for `magtwin.simulate`; all robots and episodes have the same constants.
             render_mode: Must be None.
 
         Raises:
@@ -166,7 +163,6 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         if render_mode is not None:
             raise InputError(f"MagNav has no render_mode, got {render_mode!r}; write a Run and view that")
         twin = opened(scene, network, magnetometer, model_error, "MagNav", lab=lab)
-        twin = with_plant(twin, plant)
         check_field(twin.scene, twin.field)
         network_read = twin.magnetometer
         if network_read and (missing := sorted(network_read.columns - SENSED)):

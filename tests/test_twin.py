@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 import magtwin
-from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.files.file import shipped
 from magtwin.twin import in_session, in_session_of, open_twin, simulate, sweep
+from magtwin.twin.opening import geometry
 
 
 def test_a_run_is_in_a_session_of_its_seed_unless_another_is_chosen(lab_scene):
@@ -26,33 +25,6 @@ def test_a_run_is_in_a_session_of_its_seed_unless_another_is_chosen(lab_scene):
     offsets = [float(np.mean(run["b_total_nt"] - run["b_map_nt"])) for run in (first, other, surveyed)]
     assert min(offsets[0], offsets[1]) - offsets[2] > 200  # hard_iron_drift_nt since the survey
     assert offsets[0] != offsets[1]
-
-
-def test_a_session_that_is_none_is_refused(lab_scene):
-    twin = open_twin(lab_scene, magnetometer="physical")
-    for session in (-1, 0.5, "monday", True):
-        with pytest.raises(InputError, match='session must be a whole number from 0 up, or "survey"'):
-            in_session(twin, session)
-    with pytest.raises(InputError, match="in session 2 already"):
-        simulate(in_session(twin, 2), session="survey")
-    with pytest.raises(InputError, match="give robots or sessions, not both"):
-        sweep(twin, "figure8", [1], sessions=1, robots=twin.scene.robot)
-
-
-def test_a_network_for_a_magnetometer_that_reads_none_is_refused(lab_scene):
-    with pytest.raises(InputError, match="a 'physical' magnetometer has no network"):
-        open_twin(
-            lab_scene, network=shipped("weights", "turtlebot4_paper.safetensors"), magnetometer="physical"
-        )
-
-
-def test_a_survey_in_millimetres_is_doubted(tmp_path, capsys):
-    rng = np.random.default_rng(1)
-    p, yaw = rng.uniform(-2500, 2500, (300, 2)), rng.uniform(-3, 3, 300)
-    rows = np.column_stack([p, yaw, 45_000 + 50 * np.sin(p[:, 0] / 400)])
-    np.savetxt(tmp_path / "mm.csv", rows, delimiter=",", header="x,y,yaw,b", comments="")
-    main(["map", "fit", str(tmp_path / "mm.csv"), "--method", "trilinear", "--out", str(tmp_path / "m.usdc")])
-    assert "if these are cm, write x [cm],y [cm] in the header" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_sweep_takes_paths_in_turn_and_deals_sessions_in_blocks(lab_scene):
@@ -81,17 +53,6 @@ def test_speeds_of_a_sweep_are_drawn_when_asked_for(lab_scene):
             sweep(twin, "sine", wrong)
 
 
-def test_a_sweep_saves_a_folder_that_lists_its_runs(lab_scene, tmp_path):
-    runs = sweep(open_twin(lab_scene, magnetometer="physical"), "sine", 2, duration_s=1.0, rate_hz=5.0)
-    report = runs.save(tmp_path / "runs")
-    lines = (tmp_path / "runs" / "runs.csv").read_text().splitlines()
-    assert lines[0] == "file,path,seed,session,speed_m_s,readings"
-    assert len(lines) == 3
-    again = magtwin.load_run(tmp_path / "runs" / "run_00001.parquet")
-    assert np.array_equal(again["b_measured_nt"], runs[1]["b_measured_nt"])
-    assert {figure.name: figure.value for figure in report.figures}["readings"] == 2 * again.rows
-
-
 def test_a_shipped_scene_is_opened_by_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert open_twin("lab", magnetometer="physical").scene.name == "lab"
@@ -105,15 +66,15 @@ def test_a_shipped_scene_is_opened_by_its_name(tmp_path, monkeypatch):
 
 def test_a_twin_opens_its_stage_once_and_survives_another_process(lab_scene, monkeypatch):
     twin = open_twin(lab_scene, magnetometer="physical")
-    shapes, links = twin.geometry()
+    shapes, links = geometry(twin)
     copy = pickle.loads(pickle.dumps(twin))
     assert copy.opened is None
-    assert copy.geometry()[1].keys() == links.keys()
-    assert len(copy.geometry()[0]) == len(shapes)
+    assert geometry(copy)[1].keys() == links.keys()
+    assert len(geometry(copy)[0]) == len(shapes)
     run = simulate(twin, duration_s=0.5, rate_hz=5.0)
     monkeypatch.setattr("magtwin.usd.layers.open_stage", lambda *_: pytest.fail("opened the stage again"))
     monkeypatch.setattr("magtwin.usd.scene.open_stage", lambda *_: pytest.fail("opened the stage again"))
-    assert twin.geometry()[1] is links
+    assert geometry(twin)[1] is links
     assert run.rows
 
 

@@ -16,12 +16,10 @@ ADDS = {
     "onnx": "networks as ONNX (magtwin network export, magtwin export)",
     "pandas": "runs as pandas tables (Run.to_pandas)",
     "physics": "driving in Newton (magtwin run --engine newton)",
-    "polars": "runs as polars tables (Run.to_polars)",
     "ros": "ROS 2 nodes on a machine without ROS (magtwin ros)",
     "simready": "NVIDIA's SimReady profiles (magtwin validate --against simready)",
     "validate": "NVIDIA's asset validator (magtwin validate --against nvidia)",
     "view": "pictures and films of stages (magtwin picture, magtwin film)",
-    "xarray": "runs as xarray datasets (Run.to_xarray)",
 }
 """What each extra is for."""
 

@@ -250,7 +250,7 @@ def follow(
     where: Where = HERE,
     asset: Asset = None,
     speed: float = 0.2,
-    controller: Literal["follower", "release", "stanley", "pure_pursuit"] = "follower",
+    controller: Literal["follower", "release"] = "follower",
     source: Literal["truth", "estimate", "odometry"] = "truth",
     laps: Whole = 1,
     continuous: Flag = False,
@@ -267,7 +267,7 @@ def follow(
     speed
         Forward speed on straight parts [m/s].
     controller
-        What steers: magtwin's follower, the released package's controller, Stanley's, or pure pursuit.
+        What steers: magtwin's follower, or the released package's controller.
     source
         Source of the pose: truth (enu/pose), estimate (estimate/pose) or odometry.
     laps

@@ -40,7 +40,7 @@ def view(files: Sequence[Source], *, scene: Source | None = None) -> None:
     Raises:
         InputError: A file cannot be read, or there is no viewer.
     """
-    from magtwin.twin import shipped_or
+    from magtwin.files.kinds import shipped_or
 
     paths = [shipped_or(file) for file in files]
     if not paths:
@@ -82,7 +82,7 @@ def picture(
     """
     from magtwin.figures.pictures import check_png, picture_of_stage
     from magtwin.figures.scenery import View, picture_of_run
-    from magtwin.twin import shipped_or
+    from magtwin.files.kinds import shipped_or
 
     file = existing(shipped_or(file), "run, stage or recording")
     out = check_free(check_png(out), force=force)
@@ -150,7 +150,7 @@ def report_runs(
     Raises:
         InputError: A run or `scene` cannot be read, or the page cannot be written.
     """
-    from magtwin.twin import scene_file
+    from magtwin.files.kinds import scene_file
 
     out = check_free(out, force=force)
     scene = None if scene is None else scene_file(scene)

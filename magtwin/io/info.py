@@ -10,10 +10,9 @@ from magtwin.errors import InputError, hint
 from magtwin.field.maps.statistics import map_metadata
 from magtwin.field.survey.folder import read_survey
 from magtwin.files.file import existing
-from magtwin.files.kinds import kind_of
+from magtwin.files.kinds import kind_of, shipped_or
 from magtwin.io.formats import FORMATS, read_run
 from magtwin.report.report import Figure, Report
-from magtwin.twin import shipped_or
 
 STAGES = (".usd", ".usda", ".usdc", ".usdz")
 NETWORKS = (".safetensors", ".pth", ".onnx")

@@ -15,11 +15,11 @@ from magtwin.io.formats import read_run, write_run
 from magtwin.path import CASES, PATHS, Path, path_named, read_path_csv
 from magtwin.report.report import Figure, Report
 from magtwin.run.run import COLUMNS, Run
+from magtwin.sim.motion.drive_input import path_metadata
 from magtwin.twin import (
     in_session_of,
     lab_and_map,
     locate,
-    path_metadata,
     scene_of,
     simulate,
     simulate_robots,

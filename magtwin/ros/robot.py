@@ -3,8 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +22,8 @@ from magtwin.sim.exact import check_field
 from magtwin.sim.runs.live import LiveRobot
 from magtwin.sim.runs.sensing import LidarMode
 from magtwin.sim.sensors.clock import Samples
-from magtwin.twin import Twin, model_error_of, trained_on
-
-if TYPE_CHECKING:
-    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+from magtwin.twin import Twin
+from magtwin.twin.simulation import reader
 
 WARM = 5
 """Steps of a robot before the first. They load libraries and determine the topics."""
@@ -77,14 +74,15 @@ class SimulatedRobot:
         """Put it to its start, at time 0."""
         twin = self._twin
         check_field(twin.scene, twin.field)
+        read_in = reader(twin, self._seed, which=self._which)
         self.live = LiveRobot(
             twin.scene,
             anomaly_map=twin.field,
             rng=np.random.default_rng((self._seed, 2, self._which) if self._which else self._seed),
             obstacles=twin.obstacles,
             rate_hz=self._rate,
-            network=partial(_read_rows, twin.magnetometer, trained_on(twin)) if twin.magnetometer else None,
-            model_error=model_error_of(twin, self._seed, which=self._which),
+            network=twin.magnetometer is not None,
+            finish=lambda sensed: read_in(sensed)[0],
             lidar=self._lidar,
         )
         self._stream, self._moved = None, None
@@ -186,14 +184,3 @@ class SimulatedRobot:
             columns["odom_v"] = np.repeat(self._moved, taken.sum(), axis=0)
         stamps, arrivals = (np.rint(t[taken] * NS).astype(np.int64) for t in (samples.t, samples.arrival))
         return self._renamed(topic), arrivals, topic.write(columns, stamps, self.sender)
-
-
-def _read_rows(
-    magnetometer: "NeuralMagnetometer", known: bool, run: Run
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_] | None, NDArray[Any]]:
-    """What `LiveRobot` takes of a network; `known`: whether it was trained on this robot."""
-    if not run.rows:
-        return np.zeros(0), np.zeros(0), np.zeros(0, bool), np.zeros(0)
-    inputs = run.select("t", *sorted(magnetometer.columns - {"t"}))
-    (read,) = magnetometer.read([inputs], known=[known])
-    return read.disturbance_nt, read.sd_nt, read.outside, read.stated_sd_nt

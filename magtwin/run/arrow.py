@@ -56,13 +56,7 @@ def _array(values: NDArray[Any]) -> pa.Array:
 def run_of(table: pa.Table, path: Path, first: int | None = None) -> Run:
     """The run in a table, which may also be from another program that uses the column names of a Run.
 
-    Args:
-        table: With or without the metadata of `table_of`.
-        path: Its file, for error messages.
-        first: Number of its first row, if it is a block of a longer table; its clock is then not checked.
-
-    Raises:
-        InputError: It holds no run.
+    `first` is the number of its first row, if it is a block of a longer table; its clock is then not checked.
     """
     if twice := sorted(name for name, count in Counter(table.column_names).items() if count > 1):
         raise InputError(f"{path}: two columns are called {twice[0]!r}; rename one")

@@ -1,6 +1,5 @@
 """Comparison: two runs aligned, and their differences in pose and field."""
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -117,10 +116,6 @@ class Comparison(Summarized):
                 for a in self.agreements()
             },
         }
-
-    def to_json(self) -> str:
-        """The comparison as one JSON object."""
-        return json.dumps(self.summary(), indent=2)
 
     def _summary(self) -> Summary:
         """The alignment, and the difference of each quantity."""
@@ -258,13 +253,6 @@ def traversals(a: Run, b: Run) -> Traversals:
 
     Two robots at different speeds drift apart, so their fields differ at equal times even if each is right at
     its place. Alignment by path compares them place by place.
-
-    Args:
-        a: The reference run.
-        b: Another run: by another engine, with another seed, or recorded.
-
-    Raises:
-        InputError: As for `compare`.
     """
     a, b = (run.with_columns(t=run["t"] - run["t"][0]) if run.rows else run for run in (a, b))
     recorded, timed = compare(a, b, align="none"), compare(a, b, align="time")

@@ -67,20 +67,12 @@ def _nbytes(column: pa.Array) -> int:
 
 
 def _counts(path: Path) -> list[list[int]]:
-    """Values of each column by row group. pyarrow ends the process on columns whose metadata are damaged.
-
-    Raises:
-        InputError: The metadata are damaged.
-    """
+    """Values of each column by row group. pyarrow ends the process on columns whose metadata are damaged."""
     return [[column[_COUNT] for column in group] for group in _chunks(path)]
 
 
 def _check_pages(path: Path, size: int) -> None:
-    """Refuse pages that would be too large, decompressed, in a file of `size` bytes.
-
-    Raises:
-        InputError: The pages, decompressed, are over the budget, or the metadata are damaged.
-    """
+    """Refuse pages that would be too large, decompressed, in a file of `size` bytes."""
     total, packed = 0, 0
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         for column in (column for group in _chunks(path) for column in group):

@@ -23,8 +23,6 @@ from magtwin.run.summary import run_summary
 
 if TYPE_CHECKING:
     import pandas as pd
-    import polars as pl
-    import xarray as xr
     from matplotlib.figure import Figure as Picture
 
 Metadata = Mapping[str, str | int | float | bool]
@@ -317,37 +315,6 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         how = f"rate_hz={rate_hz:g}" if rate_hz is not None else f"{len(at)} instants"
         return self._derived(f"resample({how})", columns)
 
-    def join(self, other: "Run", suffix: str = "_2") -> "Run":
-        """Add the columns of another run, held causally on this run's clock.
-
-        Each row gets the other run's last values before it. Names of columns and metadata get the suffix.
-
-        Args:
-            other: A run that covers this one, up to one of its own steps at the end. `between` cuts a run,
-                `with_columns` can shift its `t`.
-            suffix: Suffix of the other run's names.
-
-        Raises:
-            InputError: It does not cover this run, or a name would exist twice.
-        """
-        clock, theirs = check_instants(self["t"], "the run"), check_instants(other["t"], "the run to join")
-        if not len(clock) or not len(theirs):
-            raise InputError("a run of no rows cannot be joined")
-        step = float(np.diff(theirs).max(initial=0.0))
-        if clock[0] < theirs[0] or clock[-1] > theirs[-1] + step:
-            raise InputError(
-                f"the run to join goes from {theirs[0]:g} to {theirs[-1]:g} s and does not cover this one; "
-                f"{self._span()}; take what they share with between, or shift its t"
-            )
-        at = np.minimum(clock, theirs[-1])
-        held = _resampled(other, at, dict.fromkeys(other, "hold"))
-        named = {f"{name}{suffix}": values for name, values in held.items() if name != "t"}
-        if twice := sorted(named.keys() & self.columns.keys()):
-            raise InputError(f"column {twice[0]!r} is in both runs; give another suffix")
-        specs = {**self.specs, **{f"{name}{suffix}": other.spec(name) for name in held}}
-        metadata = {**{f"{key}{suffix}": value for key, value in other.metadata.items()}, **self.metadata}
-        return Run({**self.columns, **named}, metadata, specs)._derived(f"join({suffix})")
-
     @staticmethod
     def concat(runs: "Sequence[Run]", *, offset: bool = False) -> "Run":
         """Concatenate runs; only metadata that are equal in all of them are kept.
@@ -421,7 +388,12 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         Raises:
             InputError: pandas is not installed, or a column cannot stand in a table.
         """
-        frame = _optional("pandas").DataFrame(self.flat())
+        try:
+            import pandas as pd
+        except ImportError as error:
+            text = "pandas is not installed; install it with: pip install 'magtwin[pandas]'"
+            raise InputError(text) from error
+        frame = pd.DataFrame(self.flat())
         specs = {name: self.spec(column) for name, (column, _, _) in self.members().items()}
         frame.attrs = {
             "units": {name: spec.unit for name, spec in specs.items()},
@@ -429,38 +401,6 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
             "metadata": dict(self.metadata),
         }
         return frame
-
-    def to_polars(self) -> "pl.DataFrame":
-        """A polars DataFrame with the columns of `flat`, one row per reading.
-
-        Raises:
-            InputError: polars is not installed, or a column cannot stand in a table.
-        """
-        return _optional("polars").DataFrame(self.flat())
-
-    def to_xarray(self) -> "xr.Dataset":
-        """A Dataset with the coordinate `t` [s]; vectors have a second dimension of named parts.
-
-        That dimension is named after the parts (`x_y_z`, `left_right`). `units`, `frame` and `long_name` are
-        attributes of each variable; the run's metadata are attributes of the dataset.
-
-        Raises:
-            InputError: xarray is not installed, or the run has no column `t`.
-        """
-        xarray = _optional("xarray")
-        variables: dict[str, Any] = {}
-        coords: dict[str, Any] = {"t": None}
-        for name, values in self.items():
-            spec = self.spec(name)
-            attrs = {"units": spec.unit, "frame": spec.frame, "long_name": spec.doc}
-            dims: tuple[str, ...] = ("t",)
-            if values.ndim > 1:
-                dims = ("t", "_".join(spec.parts))
-                coords[dims[1]] = list(spec.parts)
-            variables[name] = (dims, values, {key: text for key, text in attrs.items() if text})
-        self["t"]  # refuses
-        coords["t"] = variables.pop("t")
-        return xarray.Dataset(variables, coords, dict(self.metadata))
 
     def plot(self, anomaly_map: Any = None) -> "Picture":
         """Draw the path over the floor and the readings against time; see `magtwin.plot`.
@@ -587,15 +527,6 @@ def _resampled(run: Run, at: NDArray[Any], rules: Mapping[str, str]) -> dict[str
             raise InputError(f"column {name!r} has rows of shape {values.shape[1:]}, not quaternions")
         columns[name] = rule(values, before, share)
     return {**columns, "t": at}
-
-
-def _optional(module: str) -> Any:
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise InputError(
-            f"{module} is not installed; install it with: pip install 'magtwin[{module}]'"
-        ) from error
 
 
 def _column(name: str, values: NDArray[Any]) -> NDArray[Any]:

@@ -13,11 +13,7 @@ class Spool:
     """A run that grows block by block to a known number of rows: in memory, or mapped if it is long."""
 
     def __init__(self, rows: int) -> None:
-        """Begin a run.
-
-        Args:
-            rows: Number of its rows.
-        """
+        """Begin a run."""
         self._rows, self._done = rows, 0
         self._columns: dict[str, NDArray[Any]] = {}
         self._last: Run | None = None
@@ -48,12 +44,7 @@ class Spool:
 
 
 def blocks(run: Run, rows: int = 0) -> Iterator[Run]:
-    """A run in blocks of rows, at least one; the memory of each is given back after it.
-
-    Args:
-        run: The run.
-        rows: Rows of a block. Default: all of a short run, and `BLOCK` of a long one.
-    """
+    """A run in blocks of rows, at least one; the memory of each is given back after it."""
     rows = rows or (mapped.BLOCK if run.rows > mapped.LONG else max(run.rows, 1))
     for first in range(0, max(run.rows, 1), rows):
         yield run.take(slice(first, first + rows))

@@ -14,13 +14,7 @@ Columns = Mapping[str, NDArray[Any]]
 def run_summary(
     columns: Columns, metadata: Mapping[str, Any], described: Sequence[tuple[str, ...]]
 ) -> Summary:
-    """The summary of a run.
-
-    Args:
-        columns: Arrays by column name, shape (N,) or (N, width).
-        metadata: The run's metadata.
-        described: Name, unit, frame and meaning of each column.
-    """
+    """The summary of a run."""
     flags = _flags(columns)
     lines = (
         ("from", _origin(metadata)),

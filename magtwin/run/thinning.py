@@ -17,10 +17,6 @@ def field_known(run: Run) -> NDArray[np.bool_]:
 def newest(ends: Rows, good: NDArray[np.bool_]) -> Rows:
     """The newest good row of each stretch of rows; its last row if none is good.
 
-    Args:
-        ends: Last row of each stretch, ascending, shape (M,). The next stretch begins at the row after it.
-        good: Whether a row can be used, shape (N,).
-
     Returns:
         Shape (M,).
     """

@@ -6,8 +6,8 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.sim.at_rest import field_at_rest_nt, in_steel, sensor_height_m
 from magtwin.sim.interference import ambient_gradient_nt_m
-from magtwin.sim.survey import field_at_rest_nt, in_steel, sensor_height_m
 from magtwin.spec.scene import Scene
 
 LEAST_NT = 500.0
@@ -62,15 +62,8 @@ def contradiction_nt(scene: Scene, anomaly_map: AnomalyMap) -> Contradiction:
     Nodes where the robot would stand in something magnetised or lose lock are left out, because a survey has
     no reading there.
 
-    Args:
-        scene: A scene with the Earth's field; its own map is not read.
-        anomaly_map: The map.
-
     Returns:
         The difference. `agrees` is true up to `LEAST_NT`, or `PART` of the map's standard deviation.
-
-    Raises:
-        InputError: The scene has no Earth's field, or the map no valid node where a robot can stand.
     """
     p_xy, yaw = anomaly_map.grid.poses()
     read = anomaly_map.recorded_yaw
@@ -116,16 +109,8 @@ def _in_lock(scene: Scene, p_xy: np.ndarray, height_m: float, asked: np.ndarray)
 def check_agrees(scene: Scene, anomaly_map: AnomalyMap, where: str) -> Contradiction | None:
     """Refuse a scene whose map contradicts its Earth and sources.
 
-    Args:
-        scene: The scene. Without the Earth's field, or without sources and furniture, the map is the truth.
-        anomaly_map: Its map.
-        where: Name of the two for the text, such as "lab.toml with the map F.usdc".
-
     Returns:
         The difference if it is small enough; None if there is nothing to contradict.
-
-    Raises:
-        InputError: They differ by more than `contradiction_nt` allows.
     """
     if scene.earth is None or not scene.magnets:
         return None

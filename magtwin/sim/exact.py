@@ -238,11 +238,7 @@ class ExactField:
 
 
 def check_truth(scene: Scene, anomaly_map: AnomalyMap) -> None:
-    """Refuse a physical magnetometer without a field: a constant map and no Earth's field.
-
-    Raises:
-        InputError: The scene is one of these.
-    """
+    """Refuse a physical magnetometer without a field: a constant map and no Earth's field."""
     physical = scene.robot.magnetometer.kind == "physical"
     if physical and ExactField(scene=scene, anomaly_map=anomaly_map).of == "none":
         raise InputError(
@@ -252,11 +248,7 @@ def check_truth(scene: Scene, anomaly_map: AnomalyMap) -> None:
 
 
 def check_field(scene: Scene, anomaly_map: AnomalyMap) -> None:
-    """Refuse a scene whose field is constant, because all places in it are alike to a magnetometer.
-
-    Raises:
-        InputError: The map is constant, and nothing on the stage is magnetised.
-    """
+    """Refuse a scene whose field is constant, because all places in it are alike to a magnetometer."""
     made = scene.magnets or scene.others  # other robots have iron too
     if not anomaly_map.is_constant or (scene.earth is not None and made):
         return
@@ -270,33 +262,26 @@ def check_field(scene: Scene, anomaly_map: AnomalyMap) -> None:
 
 
 def check_read(run: Run, anomaly_map: AnomalyMap) -> None:
-    """Refuse a run that was driven off the map, so that its readings are nan or constant.
-
-    Raises:
-        InputError: Every reading is nan, or all are the nearest value of a map that the robot never reached.
-    """
+    """Refuse a run that was driven off the map, so that its readings are nan or constant."""
     if not {"p_world_base", "b_map_nt", "b_total_nt"} <= set(run) or not run.rows:
         return
     mapped, p = run["b_map_nt"], run["p_world_base"][:, :2]
-    x0, x1, y0, y1 = anomaly_map.extent
+    moved = run.rows > 1 and np.ptp(p, axis=0).any()
     if np.isfinite(run["b_total_nt"]).any():
-        if (
-            run.rows == 1
-            or np.ptp(mapped) > 0
-            or anomaly_map.contains(p).any()
-            or not np.ptp(p, axis=0).any()
-        ):
+        if not moved or np.ptp(mapped) > 0 or anomaly_map.contains(p).any():
             return
-        what = f"all {run.rows:,} readings are {mapped[0]:,.0f} nT, the map's nearest value, as the robot"
+        what = f"{mapped[0]:,.0f} nT, the map's nearest value"
     elif np.isfinite(mapped).any():
         raise InputError(
             f"all {run.rows:,} readings are nan though the robot drove on the map: the network gives nan, as "
             "one of its inputs is not known here; take a physical magnetometer, or another network"
         )
     else:
-        what = f"all {run.rows:,} readings are nan, as the robot"
+        what = "nan"
+    x0, x1, y0, y1 = anomaly_map.extent
     low, high = p.min(axis=0), p.max(axis=0)
     raise InputError(
-        f"{what} drove x {low[0]:.2f}..{high[0]:.2f}, y {low[1]:.2f}..{high[1]:.2f} m, where the map "
-        f"{anomaly_map.name!r} (x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m) has no valid node; choose a path on it"
+        f"all {run.rows:,} readings are {what}, as the robot drove x {low[0]:.2f}..{high[0]:.2f}, "
+        f"y {low[1]:.2f}..{high[1]:.2f} m, where the map {anomaly_map.name!r} (x {x0:g}..{x1:g}, "
+        f"y {y0:g}..{y1:g} m) has no valid node; choose a path on it"
     )

@@ -94,17 +94,7 @@ engine = ENGINES.register
 def start_sensors(
     sensors: Iterable[str | SensorFactory], scene: Scene, rng: np.random.Generator
 ) -> list[Sensor]:
-    """Custom sensors at the start of a run, each with its own generator.
-
-    Args:
-        sensors: Names of registered sensors, or factories.
-        scene: Lab and robot.
-        rng: Source of all their noise.
-
-    Raises:
-        UnknownNameError: No such sensor; the text names the nearest one.
-        InputError: Two sensors add the same column, or one that magtwin uses.
-    """
+    """Custom sensors at the start of a run, each with its own generator."""
     chosen = [SENSORS[one] if isinstance(one, str) else one for one in sensors]
     started = [make(scene, own) for make, own in zip(chosen, rng.spawn(len(chosen)), strict=True)]
     taken = set(COLUMNS)

@@ -63,9 +63,6 @@ def ambient_field_nt(scene: Scene, p_world: ArrayLike) -> Array:
 
     Returns:
         Field in world axes [nT], shape (..., 3).
-
-    Raises:
-        InputError: The scene has no Earth's field, or a shape is wrong.
     """
     earth, bodies = _known(scene)
     p = np.asarray(p_world, float)
@@ -78,16 +75,8 @@ def ambient_field_nt(scene: Scene, p_world: ArrayLike) -> Array:
 def level_field_nt(scene: Scene, p_xy: ArrayLike, height_m: float) -> tuple[Array, Array]:
     """`ambient_field_nt` at one height, to 1e-3 nT, and its slopes along x and y, for robots that drive.
 
-    Args:
-        scene: A scene whose Earth's field is known.
-        p_xy: Points [m], shape (N, 2).
-        height_m: Their height above the floor [m].
-
     Returns:
         Field [nT], shape (N, 3), and dB/dx, dB/dy [nT/m], shape (N, 2, 3), in world axes.
-
-    Raises:
-        InputError: As for `ambient_field_nt`.
     """
     earth = _known_earth(scene)
     plane = _plane(scene.magnets, earth, float(height_m))
@@ -101,16 +90,8 @@ def level_gradient_nt_m(scene: Scene, p_xy: ArrayLike, height_m: float) -> Array
     The vertical slopes follow from those along x and y, because curl B = 0 and div B = 0 outside of
     magnetised things.
 
-    Args:
-        scene: A scene whose Earth's field is known.
-        p_xy: Points [m], shape (N, 2).
-        height_m: Their height above the floor [m].
-
     Returns:
         Gradient [nT/m], shape (N,).
-
-    Raises:
-        InputError: As for `ambient_field_nt`.
     """
     total, slopes = level_field_nt(scene, p_xy, height_m)
     (xx, xy, xz), (yx, yy, yz) = np.moveaxis(slopes, 0, -1)
@@ -124,15 +105,8 @@ def level_gradient_nt_m(scene: Scene, p_xy: ArrayLike, height_m: float) -> Array
 def ambient_gradient_nt_m(scene: Scene, p_world: ArrayLike) -> Array:
     """Steepness of the lab's field: |grad |B||.
 
-    Args:
-        scene: A scene whose Earth's field is known.
-        p_world: Points [m], shape (..., 3).
-
     Returns:
         Gradient [nT/m], shape (...).
-
-    Raises:
-        InputError: As for `ambient_field_nt`.
     """
     earth, bodies = _known(scene)
     p = np.asarray(p_world, float)
@@ -236,15 +210,8 @@ def turning_iron_nt(robot: RobotSpec, wheel_angle: ArrayLike) -> Array:
     moment points up at the angle 0 and forwards a quarter turn later. The caster rolls straight on, by the
     mean distance of the wheels; that its axis turns on curves is neglected.
 
-    Args:
-        robot: Its platform, drive and magnetometer.
-        wheel_angle: Angles turned by the left and right wheel since the start [rad], shape (N, 2).
-
     Returns:
         Field in base_link axes [nT], shape (N, 3).
-
-    Raises:
-        InputError: The magnetometer is in the middle of a wheel or of the caster.
     """
     platform, angle = robot.platform, np.asarray(wheel_angle, float)
     rolled = (angle[:, 0] + angle[:, 1]) * (robot.drive.wheel_radius_m / platform.caster_radius_m / 2)
@@ -312,10 +279,6 @@ def ambient_at_sensor_nt(scene: Scene, true: Moment) -> tuple[Array, Array]:
     The rate is d/dt (R^T B) = R^T dB/dt - w x R^T B, with dB/dt = (u . grad) B for the magnetometer's
     velocity u, that of the twist from now on.
 
-    Args:
-        scene: A scene whose Earth's field is known.
-        true: The motion of its robot, N moments.
-
     Returns:
         Field [nT] and rate [nT/s], shape (N, 3) each.
     """
@@ -346,15 +309,7 @@ def own_field_nt(
 ) -> Array:
     """The field at the magnetometer of a robot that drives, from the ambient field there, without its plant.
 
-    Args:
-        robot: The robot.
-        motion: What it did.
-        t: Times of the readings [s], shape (N,).
-        b_base: Ambient field in base_link axes [nT], shape (N, 3).
-        b_rate: Its rate of change in base_link axes [nT/s], shape (N, 3).
-        true: The motion at these times.
-        lidar_on: Whether the LiDAR spins, shape (N,).
-        supply_a: Current drawn from the battery [A], shape (N,).
+    Arrays have a row for each of N readings at times t; `true` is the motion at these times.
 
     Returns:
         Field in base_link axes [nT], shape (N, 3).
@@ -400,10 +355,6 @@ def draw_platform(platform: PlatformFieldSpec, rng: np.random.Generator) -> Plat
     TurtleBot 4 in Florida, where the field dips by 58 deg, the drift makes 690 nT and a wave of 130 nT; the
     90 nT between sessions make 77 nT and a wave of 70 nT (root mean squares).
 
-    Args:
-        platform: The platform of the asset, in the session of the survey.
-        rng: Source of the session.
-
     Returns:
         The platform with these figures drawn, its drift and spreads 0. `hard_iron_change_nt` is the change
         since the survey.
@@ -438,9 +389,6 @@ def draw_platform(platform: PlatformFieldSpec, rng: np.random.Generator) -> Plat
 
 def platforms_of_rows(platforms: Sequence[PlatformFieldSpec]) -> PlatformFieldSpec:
     """Platforms of many robots as one, for readings that each belong to another robot.
-
-    Args:
-        platforms: Those of one robot in several sessions, from `draw_platform`; one for each reading.
 
     Returns:
         The first platform, with arrays of a row or number per robot for the figures in `DRAWN`.

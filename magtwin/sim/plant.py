@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.field.sources.dipoles import MU_0_OVER_4_PI, NT_PER_T
-from magtwin.sim.sensors.stateful import Stateful
 from magtwin.spec.plant import PlantSpec
 
 Array = NDArray[np.float64]
@@ -26,31 +25,15 @@ Array = NDArray[np.float64]
 BLOCK = 2048
 """Readings whose play is computed at a time: their arrays stay in the cache."""
 
-_DRAWN = (
-    *("warm_up_nt", "warm_up_soft_iron", "warm_up_age_s", "motor_abs_nt_nm", "motor_square_nt_nm2"),
-    *("lidar_speed_nt_s_m", "lidar_supply_nt_a", "moving_moment", "pan_phase"),
-)
-"""Fields that differ between sessions, and so between robots that are stepped together."""
 
+class Plant:
+    """A robot's plant in a run, continued from call to call."""
 
-class Plant(Stateful):
-    """A robot's plant in a run: continued from call to call, for one robot or for robots stepped together.
-
-    Arrays have time as their first axis, and robots, if there are several, as their second.
-    """
-
-    def __init__(self, spec: PlantSpec, rng: np.random.Generator) -> None:
-        """Begin a run.
-
-        Args:
-            spec: The plant in its session.
-            rng: Not drawn from.
-        """
-        drawn = {name: np.array(getattr(spec, name), float) for name in _DRAWN}
-        memory = play(np.array([spec.start_field_nt]), spec.play_thresholds_nt)[-1]
-        super().__init__(rng, play=memory, **drawn)
+    def __init__(self, spec: PlantSpec) -> None:
+        """Begin a run with the plant as it is in its session."""
         self.spec = spec
         self.needs_torques = any(spec.motor_abs_nt_nm) or any(spec.motor_square_nt_nm2)
+        self._played = play(np.array([spec.start_field_nt]), spec.play_thresholds_nt)[-1]
 
     def field_nt(
         self,
@@ -65,8 +48,7 @@ class Plant(Stateful):
         """The field at the next readings; one call for a run and many for its pieces give the same bytes.
 
         Args:
-            t: Times since the start of the run [s], shape (N,), or (N, R) for robots stepped together; all
-                other shapes likewise.
+            t: Times since the start of the run [s], shape (N,).
             b_base: Ambient field in base_link axes [nT], shape (N, 3); a row with nan keeps the hysteresis.
             torques_nm: Torques of left and right wheel [N m], shape (N, 2).
             speed: Forward speed [m/s], shape (N,).
@@ -79,16 +61,15 @@ class Plant(Stateful):
         spec, b = self.spec, np.asarray(b_base, float)
         field, t = np.zeros(b.shape), np.asarray(t, float)
         if any(spec.hysteresis):
-            played = play(b, spec.play_thresholds_nt, self.state["play"])
+            played = play(b, spec.play_thresholds_nt, self._played)
             if len(played):
-                self.state["play"] = played[-1]
+                self._played = played[-1]
             weighted = sum(w * played[..., i, :] for i, w in enumerate(spec.play_weights))
             field += _turned(np.reshape(spec.hysteresis, (3, 3)), weighted + 0.0 * b)
-        now = self.state
         for j, tau in enumerate(spec.warm_up_s):
-            warm = -np.expm1(-(t + now["warm_up_age_s"]) / tau)[..., None]
-            field += warm * now["warm_up_nt"][..., 3 * j : 3 * j + 3]
-            field += warm * now["warm_up_soft_iron"][..., j : j + 1] * b
+            warm = -np.expm1(-(t + spec.warm_up_age_s) / tau)[:, None]
+            field += warm * np.array(spec.warm_up_nt[3 * j : 3 * j + 3])
+            field += warm * spec.warm_up_soft_iron[j] * b
         torques, on = np.asarray(torques_nm, float), np.asarray(lidar_on, bool)
         for name, amount in (
             ("motor_abs_nt_nm", np.abs(torques[..., 0]) + np.abs(torques[..., 1])),
@@ -97,7 +78,7 @@ class Plant(Stateful):
             ("lidar_supply_nt_a", on * np.asarray(supply_a, float)),
         ):
             if any(getattr(spec, name)):
-                field += np.asarray(amount)[..., None] * now[name]
+                field += np.asarray(amount)[..., None] * np.array(getattr(spec, name))
         if any(spec.moving_moment):
             field += self._moving_nt(t)
         return field
@@ -106,7 +87,7 @@ class Plant(Stateful):
         """Field of the panning dipole: mu_0 / 4 pi (3 (m . u) u - m) / |r|^3."""
         spec, angle = self.spec, self.pan(t)
         cos, sin = np.cos(angle), np.sin(angle)
-        x, y, z = np.moveaxis(self.state["moving_moment"], -1, 0)
+        x, y, z = spec.moving_moment
         m = np.stack([cos * x - sin * y, sin * x + cos * y, z + 0.0 * cos], axis=-1)
         arm = spec.moving_arm_m
         px, py, pz = spec.p_magnetometer_moving
@@ -118,7 +99,7 @@ class Plant(Stateful):
     def pan(self, t: ArrayLike) -> Array:
         """Pan angle of the moving part: a triangle over time whose tips are cut off where it rests [rad]."""
         spec = self.spec
-        cycles = np.asarray(t, float) / spec.pan_period_s + self.state["pan_phase"]
+        cycles = np.asarray(t, float) / spec.pan_period_s + spec.pan_phase
         triangle = 4 * np.abs(cycles - np.floor(cycles) - 0.5) - 1
         return np.asarray(spec.pan_range * np.clip(triangle / (1 - spec.pan_dwell), -1, 1))
 

@@ -153,10 +153,6 @@ PLANTS: Mapping[str, Callable[[Entropy], PlantSpec]] = {
 def draw_session_plant(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
     """The robot with its plant as in one session.
 
-    Args:
-        robot: The robot in its session, but for the plant.
-        rng: Source of the session.
-
     Returns:
         The robot with a plant whose spreads are 0, its permanent field, the directions of its current terms,
         and marker offset and latency of motion capture drawn too.
@@ -214,15 +210,7 @@ def draw_session_plant(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
 
 
 def plant_of(text: str, *, which: int = 0) -> PlantSpec:
-    """The plant of a text "NAME" or "NAME:SEED", or of what `plant_text` gave; without a seed it is 0.
-
-    Args:
-        text: The text.
-        which: Index of the robot in its scene.
-
-    Raises:
-        InputError: There is no such family, or the seed is no whole number from 0 up.
-    """
+    """The plant of a text "NAME" or "NAME:SEED", or of what `plant_text` gave; without a seed it is 0."""
     if text.startswith("{"):
         try:
             given = json.loads(text)

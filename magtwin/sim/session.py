@@ -45,10 +45,6 @@ _STREAMS = ("battery", "imu", "lidar", "drive", "platform")
 def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
     """The robot in one session: charge, IMU, LiDAR's phase, wheels and odometry, and its own field.
 
-    Args:
-        robot: The robot of the asset.
-        rng: Source of the session.
-
     Returns:
         The robot with `initial_fraction`, `yaw_zero`, `gyro_bias`, `phase_s`, `wheel_errors` and
         `odometry_scale` drawn, and its platform from `magtwin.sim.interference.draw_platform`. The standard
@@ -94,14 +90,7 @@ def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
 
 
 def session_of(robot: RobotSpec, seed: int, session: int, *, which: int = 0) -> RobotSpec:
-    """The robot in a numbered session of a data set.
-
-    Args:
-        robot: The robot of the asset.
-        seed: Seed of the data set.
-        session: Number of the session, from 0.
-        which: Index of the robot in its scene.
-    """
+    """The robot in a numbered session of a data set."""
     key = (0, session, which) if which else (0, session)
     return draw_session(
         robot, np.random.default_rng(np.random.SeedSequence((seed, 1), spawn_key=key))
@@ -111,14 +100,7 @@ def session_of(robot: RobotSpec, seed: int, session: int, *, which: int = 0) -> 
 def offset_generator(
     session: Mapping[str, str | int | float | bool], seed: int, *, which: int = 0
 ) -> np.random.Generator:
-    """Generator of the part of the model error that is constant in a session.
-
-    Args:
-        session: Metadata of the session, `session_seed` and `session`. Without them each seed is its own
-            session.
-        seed: Seed of the run.
-        which: Index of the robot in its scene.
-    """
+    """Generator of the part of the model error that is constant in a session."""
     entropy, key = seed, (3, 0, which)
     if "session_seed" in session:
         entropy, key = int(session["session_seed"]), (2, int(session["session"]), which)

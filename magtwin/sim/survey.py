@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.grid import Grid
@@ -15,10 +15,10 @@ from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.holes import filled
 from magtwin.field.maps.made_from import made_from
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.sources.magnets import body_of
 from magtwin.field.survey.readings import Readings
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
 from magtwin.parallel import run_all
+from magtwin.sim.at_rest import field_at_rest_nt, in_steel, places_at_rest, sensor_height_m
 from magtwin.sim.interference import ambient_field_nt, ambient_gradient_nt_m, platform_field_nt
 from magtwin.sim.sensors.magnetometer import lost_in, rounded, stuck_nt
 from magtwin.spec.lab import SurveySpec
@@ -33,56 +33,10 @@ MOST_READINGS = 100_000
 LEAST_REACH_M = 0.01
 """Least distance between the points through which a field is taken as quadratic [m]."""
 
-FLOOR_M = 0.01
-"""Height up to which the robot drives over things [m]."""
-
 QUARTERS = (0.0, np.pi / 2, np.pi, 3 * np.pi / 2)
 
 
-def field_at_rest_nt(
-    scene: Scene, p_world_base: ArrayLike, yaw: ArrayLike, *, height_m: float | None = None
-) -> Array:
-    """Exact field magnitude at the magnetometer of a robot that stands with its LiDAR off.
-
-    |(1 + S) R(yaw)^T B(p_base + R(yaw) p_lever) + h|: the map's field without its grid. A run's exact field
-    minus this is the part of motion, motors, LiDAR and battery.
-
-    Args:
-        scene: A scene whose Earth's field is known.
-        p_world_base: Positions of base_link [m], shape (..., 3), or (..., 2) for a robot on the floor.
-        yaw: Headings [rad], shape (...); the two shapes are broadcast.
-        height_m: Height of the magnetometer above the floor [m]. Default: the robot's.
-
-    Returns:
-        Field magnitude [nT], shape (...).
-    """
-    p, yaw = np.asarray(p_world_base, float), np.asarray(yaw, float)
-    shape = np.broadcast_shapes(p.shape[:-1], yaw.shape)
-    turn = quat_from_yaw(np.broadcast_to(yaw, shape))
-    p_world = _sensor_places(scene, p, yaw, height_m)
-    b_body = rotate(quat_conjugate(turn), ambient_field_nt(scene, p_world)).reshape(-1, 3)
-    field = platform_field_nt(scene.robot.platform, b_body)
-    return np.asarray(np.linalg.norm(field, axis=-1)).reshape(shape)
-
-
-def _sensor_places(scene: Scene, p: Array, yaw: Array, height_m: float | None) -> Array:
-    """Places of the magnetometer in world [m] for base_link at points (..., 2 or 3), headings (...)."""
-    if p.shape[-1] == 2:
-        p = np.concatenate([p, np.full((*p.shape[:-1], 1), scene.robot.base_height_m)], axis=-1)
-    shape = np.broadcast_shapes(p.shape[:-1], yaw.shape)
-    turn = quat_from_yaw(np.broadcast_to(yaw, shape))
-    p_world = p + rotate(turn, np.broadcast_to(scene.robot.p_base_magnetometer, (*shape, 3)))
-    if height_m is not None:
-        p_world[..., 2] = height_m
-    return p_world
-
-
-def sensor_height_m(scene: Scene) -> float:
-    """Height of the magnetometer above the floor on which the robot stands [m]."""
-    return scene.robot.base_height_m + scene.robot.p_base_magnetometer[2]
-
-
-def survey_readings(
+def visit(
     scene: Scene,
     *,
     rng: np.random.Generator,
@@ -98,7 +52,7 @@ def survey_readings(
     progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
     blocked: Callable[[Array], NDArray[np.bool_]] | None = None,
     jobs: int | None = None,
-) -> Readings:
+) -> tuple[Readings, NDArray[np.bool_]]:
     """Readings of the robot at each node of a grid, in each heading.
 
     base_link stands on the node, so the magnetometer is beside it by its lever arm, turned with the heading.
@@ -125,35 +79,9 @@ def survey_readings(
             several threads.
 
     Returns:
-        A row for each node, in the order of `Grid.poses`, with magnitudes; `good` where the robot can stand.
-
-    Raises:
-        InputError: The Earth's field is unknown, the grid has no cell, or a figure is out of range.
+        A row for each node, in the order of `Grid.poses`, with magnitudes, `good` where the robot can stand;
+        and the nodes without a reading, shape (H, Y, X): lock was lost, or the node is blocked.
     """
-    about: dict[str, Any] = {"source": source, "licence": licence, "created": created}
-    about |= {"blocked": blocked, "jobs": jobs}
-    about |= {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}
-    return _visit(scene, rng, spacing_m, headings_rad, readings, height_m, progress, **about)[0]
-
-
-def _visit(
-    scene: Scene,
-    rng: np.random.Generator,
-    spacing_m: float = 0.25,
-    headings_rad: Sequence[float] = QUARTERS,
-    readings: int = 1,
-    height_m: float | None = None,
-    progress: Callable[[int, int, str], Any] = lambda done, total, what: None,
-    *,
-    heading_error_rad: float = 0.0,
-    position_error_m: float = 0.0,
-    source: str = "",
-    licence: str = "",
-    created: str = "",
-    blocked: Callable[[Array], NDArray[np.bool_]] | None = None,
-    jobs: int | None = None,
-) -> tuple[Readings, NDArray[np.bool_]]:
-    """The readings, and the nodes without one, shape (H, Y, X): lock was lost, or the node is blocked."""
     if not 1 <= readings <= MOST_READINGS:
         most = f" and at most {MOST_READINGS:,}" if readings > MOST_READINGS else ""
         raise InputError(f"readings must be at least 1{most}, got {readings!r}")
@@ -221,6 +149,11 @@ def _visit(
     return read, lost
 
 
+def survey_readings(scene: Scene, *, rng: np.random.Generator, **options: Any) -> Readings:
+    """The readings of `visit`, whose arguments these are."""
+    return visit(scene, rng=rng, **options)[0]
+
+
 def _at_nodes(
     scene: Scene, height_m: float | None, height: float, poses: tuple[Array, Array]
 ) -> tuple[Array, NDArray[np.bool_]]:
@@ -230,7 +163,7 @@ def _at_nodes(
     exact = field_at_rest_nt(scene, stands, yaw, height_m=height_m)
     if not sensor.gradient_max_nt_m:
         return exact, np.zeros(exact.shape, bool)
-    gradient = ambient_gradient_nt_m(scene, _sensor_places(scene, stands, yaw, height))
+    gradient = ambient_gradient_nt_m(scene, places_at_rest(scene, stands, yaw, height))
     return exact, lost_in(sensor, gradient.ravel()).reshape(gradient.shape)
 
 
@@ -244,29 +177,19 @@ def survey(
     name: str | None = None,
     **options: Any,
 ) -> AnomalyMap:
-    """Map the lab as the robot would: the values at the nodes are those of `survey_readings`.
+    """Map the lab as the robot would: the values at the nodes are those of `visit`.
 
     The variance of a node is that of the sensor's noise and resolution, plus the mean square by which the
     field at the robot's actual pose differs from that at the node. Between nodes, the error of interpolation
     is estimated from the nodes (`magtwin.field.maps.curvature`).
 
-    Args:
-        scene: As for `survey_readings`.
-        rng: As for `survey_readings`.
-        readings: As for `survey_readings`.
-        heading_error_rad: As for `survey_readings`; the map takes each heading as the node's.
-        position_error_m: As for `survey_readings`.
-        name: Name of the map. Default: the scene's.
-        options: The other arguments of `survey_readings`.
+    Arguments are those of `visit`, and the map's name, by default the scene's.
 
     Returns:
         The map, with its variance. Nodes that are blocked or where lock was lost are not valid.
-
-    Raises:
-        InputError: As for `survey_readings`.
     """
     errors: dict[str, Any] = {"heading_error_rad": heading_error_rad, "position_error_m": position_error_m}
-    read, lost = _visit(scene, rng, readings=readings, **errors, **options)
+    read, lost = visit(scene, rng=rng, readings=readings, **errors, **options)
     assert read.grid is not None
     assert read.height_m is not None
     sensor, grid = scene.robot.magnetometer, read.grid
@@ -308,13 +231,6 @@ def pose_error_nt2(
     E[(B(node + e) - B(node))^2] over normal errors e, by a rule of degree 5 (McNamee and Stenger 1967;
     2 n^2 + 1 points for n errors), which is exact for a parabola. The vector field around a node is the same
     for all headings: quadratic in x and y, through 3 x 3 points.
-
-    Args:
-        scene: A scene whose Earth's field is known.
-        grid: The nodes.
-        height_m: Height of the magnetometer above the floor [m].
-        heading_error_rad: Standard deviation of the heading [rad].
-        position_error_m: Standard deviation of the place, along x and y [m].
 
     Returns:
         Mean square [nT^2], shape (H, Y, X).
@@ -433,19 +349,8 @@ def survey_room(
 ) -> Surveyed:
     """Survey a scene, and fill the nodes that the robot cannot reach.
 
-    Args:
-        scene: A scene whose Earth's field is known; its map is not read.
-        spec: Grid and errors of the survey.
-        seed: Seed of the sensor's noise and of the robot's errors.
-        obstacles: What stands in the room.
-        source: File that the scene was made from.
-        progress: As for `survey_readings`.
-
     Returns:
         The map, and the number of filled nodes.
-
-    Raises:
-        InputError: As for `survey`, or a heading has no reading at all.
     """
     field = survey(
         scene,
@@ -482,10 +387,6 @@ def blocked_by(scene: Scene, obstacles: Obstacles) -> Callable[[Array], NDArray[
 
     Walls at the border of the floor do not count, because the map is needed up to them.
 
-    Args:
-        scene: The scene.
-        obstacles: What stands in it.
-
     Returns:
         A function from nodes [m], shape (..., 2), to whether each is blocked, shape (...).
     """
@@ -505,32 +406,6 @@ def blocked_by(scene: Scene, obstacles: Obstacles) -> Callable[[Array], NDArray[
         return np.asarray((distance < radius) | inside).reshape(nodes.shape[:-1])
 
     return blocked
-
-
-def in_steel(scene: Scene, p: Array, height_m: float) -> NDArray[np.bool_]:
-    """Whether a robot at points (N, 2) of the floor would stand in something magnetised, shape (N,).
-
-    Args:
-        scene: The scene.
-        p: Places of its base [m].
-        height_m: Height of the robot [m]. Things lower than `FLOOR_M` are no obstacle.
-    """
-    radius = scene.robot.footprint_radius_m
-    inside = np.zeros(len(p), bool)
-    for source in scene.magnets:
-        if source.shape == "point":
-            continue
-        body = body_of(replace(source, susceptibility=0.0))
-        middle = body.p_world + body.rotation @ body.middle
-        half = np.abs(body.rotation) @ (body.size_m / 2)
-        near = np.flatnonzero(np.all(np.abs(p - middle[:2]) < half[:2] + radius, axis=1))
-        low, high = middle[2] - half[2], middle[2] + half[2]
-        if high <= FLOOR_M or low >= height_m or not len(near):
-            continue
-        for z in np.linspace(max(low, FLOOR_M), min(high, height_m), 5):
-            at = np.column_stack([p[near], np.full(len(near), z)])
-            inside[near] |= body.clearance(at) < radius
-    return inside
 
 
 def _nearest_to_middle(outline: Array) -> Array:

@@ -195,10 +195,6 @@ def parts_of(
         size_m: Sides of the bounding box of a box or cylinder [m].
         vertices_m: Vertices of a mesh [m].
         faces: Corners of its triangles.
-
-    Raises:
-        UnknownNameError: There is no such kind or material; the text has the nearest name.
-        InputError: A generic piece lacks material or size, or another kind has one.
     """
     if kind not in GENERIC:
         make = find("furniture", kind, {**KINDS, **dict.fromkeys(GENERIC)})

@@ -13,9 +13,6 @@ def check_mesh(vertices: NDArray[np.float64], faces: NDArray[np.intp], what: str
         vertices: Vertices [m], shape (V, 3).
         faces: Corners of the triangles, counter-clockwise from outside, shape (F, 3).
         what: How the text of a refusal begins: "source 'desk'".
-
-    Raises:
-        InputError: The mesh is not closed, or encloses no volume.
     """
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,):
         raise InputError(

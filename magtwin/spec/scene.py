@@ -60,11 +60,7 @@ class Scene(Summarized, Spec):
         return (PlacedRobot(robot=self.robot, start=self.start, path=self.path), *self.others)
 
     def led_by(self, name: str) -> "Scene":
-        """The scene with the robot called `name` as the first robot.
-
-        Raises:
-            UnknownNameError: There is no such robot; the text has the nearest name.
-        """
+        """The scene with the robot called `name` as the first robot."""
         placed = find("robot", name, {placed.robot.name: placed for placed in self.robots})
         rest = tuple(other for other in self.robots if other.robot.name != name)
         return replace(self, robot=placed.robot, start=placed.start, path=placed.path, others=rest)

@@ -17,6 +17,7 @@ import numpy as np
 from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files.file import existing, read_text, sha256
+from magtwin.files.kinds import scene_file
 from magtwin.files.outputs import check_free, output, transaction
 from magtwin.io.formats import read_run
 from magtwin.io.map_files import map_file, open_map
@@ -46,7 +47,7 @@ from magtwin.learn.models.predictor import Predictor, load_predictor
 from magtwin.learn.training.result import widened_card
 from magtwin.run.run import Run
 from magtwin.spec.scene import Scene
-from magtwin.twin import check_scene, in_session_of, open_twin, scene_file
+from magtwin.twin import check_scene, in_session_of, open_twin
 from magtwin.usd.scene import read_scene
 
 File = str | os.PathLike[str]

@@ -26,6 +26,12 @@ Report = Callable[[str], Any]
 Progress = Callable[[int, int, str], Any]
 
 
+def new_workshop() -> str:
+    """A temporary folder, deleted when Python ends."""
+    _WORKSHOPS.append(tempfile.TemporaryDirectory(prefix="magtwin-"))
+    return _WORKSHOPS[-1].name
+
+
 def scene_from_toml(
     path: str | FilePath,
     *,
@@ -66,9 +72,7 @@ def scene_from_toml(
 
     if map_layer is not None:
         check_map_layer(map_layer)
-    if workshop is None:
-        _WORKSHOPS.append(tempfile.TemporaryDirectory(prefix="magtwin-"))
-        workshop = _WORKSHOPS[-1].name
+    workshop = workshop or new_workshop()
 
     def inputs_of(weights: FilePath) -> tuple[str, ...]:
         from magtwin.learn.models.predictor import load_predictor

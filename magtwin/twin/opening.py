@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import importlib
 import shutil
 import tempfile
 import warnings
@@ -22,12 +23,12 @@ from magtwin.twin.twin import (
     Metadata,
     Twin,
     scene_sha256,
-    without_model_error,
     without_tracking_error,
 )
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+    from magtwin.usd.geometry import Link, Shape
     from magtwin.usd.scene import OpenedScene
 
 _CHECKSUMS = {"map_sha256": "its map", "network_sha256": "its network", "scene_sha256": "the scene"}
@@ -133,24 +134,20 @@ def _stale(stage: "OpenedScene") -> str:
     )
 
 
-def opened(
-    twin: Twin | Scene | str | FilePath,
-    network: str | FilePath | None,
-    magnetometer: Kind | None,
-    model_error: bool,
-    function: str,
-    **where: Any,
-) -> Twin:
-    """The twin, opened if it is a scene; `function` is named in the refusal of options that come too late.
+def geometry(twin: Twin) -> "tuple[list[Shape], dict[str, Link]]":
+    """Shapes of the lab and the first robot, and the links of that robot, for writers and viewers.
 
-    `where` are further options of `open_twin`.
+    They come from the stage that `open_twin` opened. A twin from another process opens it again.
     """
-    if not isinstance(twin, Twin):
-        return open_twin(twin, network=network, magnetometer=magnetometer, model_error=model_error, **where)
-    if network is not None or magnetometer is not None or any(where.values()):
-        names = ", ".join(f"`{name}`" for name in ("network", *where))
-        raise InputError(f"give {names} and `magnetometer` to open_twin, not to {function}, which got a Twin")
-    return twin if model_error else without_model_error(twin)
+    from magtwin.usd.geometry import read_links, read_shapes
+    from magtwin.usd.scene import open_alone
+
+    name = twin.scene.robot.name
+    if twin.opened is not None:
+        alone = twin.opened.alone(name)
+        return alone.shapes, alone.links
+    stage = open_alone(twin.scene_file, name, lab=str(twin.metadata.get("lab", "")))
+    return list(read_shapes(stage)), read_links(stage)
 
 
 class _TemporaryStage:
@@ -166,10 +163,9 @@ class _TemporaryStage:
 
 def _open_in_memory(scene: Scene, **options: Any) -> Twin:
     """The twin of a scene without a file, authored to a temporary folder."""
-    from magtwin.author.scene import author_scene
-
     stage = _TemporaryStage()
-    twin = open_twin(author_scene(scene, stage.folder / "scene"), **options)
+    author = importlib.import_module("magtwin.author.scene")  # by name: who opens a stage needs no author
+    twin = open_twin(author.author_scene(scene, stage.folder / "scene"), **options)
     metadata = {name: value for name, value in twin.metadata.items() if name != "scene_file"}
     return dataclasses.replace(twin, metadata=metadata, stage=stage)
 
@@ -317,16 +313,7 @@ def twin_of(
 
 
 def check_scene(scene: Scene, metadata: Mapping[str, str | int | float | bool], name: str) -> None:
-    """Refuse a scene whose values differ from those that a run was made with.
-
-    Args:
-        scene: The scene, its robot in the run's session.
-        metadata: Metadata of the run.
-        name: Name of the run.
-
-    Raises:
-        InputError: The checksum of the scene's values differs, or the run has none.
-    """
+    """Refuse a scene whose values differ from those that a run was made with."""
     ours, its = scene_sha256(scene), metadata.get("config_sha256", "none")
     if ours != its:
         raise InputError(

@@ -1,6 +1,5 @@
 """Robot scene: a mobile robot from its URDF, with a magnetometer, in a room."""
 
-import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -12,7 +11,7 @@ from magtwin.files.file import existing, shipped
 from magtwin.files.kinds import expected
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import MagnetometerSpec
-from magtwin.twin.authoring import scene_from_toml
+from magtwin.twin.authoring import new_workshop, scene_from_toml
 
 ROOM_RADIUS_M, ROOM_TURN_M = 0.3, 0.28
 """Footprint radius and turning radius of robots for which the room has space [m]."""
@@ -61,11 +60,7 @@ def scene_with_robot(
     from magtwin.usd.robot import load_robot
 
     file = expected(FilePath(robot), "robot")
-    if workshop is None:
-        from magtwin.twin import authoring
-
-        authoring._WORKSHOPS.append(tempfile.TemporaryDirectory(prefix="magtwin-"))
-        workshop = authoring._WORKSHOPS[-1].name
+    workshop = workshop or new_workshop()
     asset, stem = file, file.name.lstrip(".").split(".")[0] or "robot"
     if file.suffix.lower() in (".urdf", ".xacro", ".xml"):
         options = Options(

@@ -1,7 +1,7 @@
 """Simulate: a twin and a path become a Run."""
 
-import hashlib
-from collections.abc import Callable, Iterable, Mapping
+import importlib
+from collections.abc import Callable, Iterable
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -12,25 +12,11 @@ from magtwin.errors import InputError, find
 from magtwin.path import Path
 from magtwin.report.verdict import OWN
 from magtwin.run.run import Run
-from magtwin.sim.motion.drive_input import drive_input
+from magtwin.sim.motion.drive_input import DriveInput, drive_input, path_metadata
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.scene import Scene
-from magtwin.twin.opening import led_by, open_twin, opened
-from magtwin.twin.twin import (
-    OF_SCENE,
-    Kind,
-    Metadata,
-    Session,
-    Twin,
-    checked_seed,
-    in_session,
-    in_session_of,
-    model_error_of,
-    room_of,
-    scene_sha256,
-    trained_on,
-    with_plant,
-)
+from magtwin.twin.session import in_session, in_session_of, model_error_of, room_of, trained_on, with_plant
+from magtwin.twin.twin import OF_SCENE, Kind, Metadata, Session, Twin, checked_seed, opened, scene_sha256
 from magtwin.version import __version__
 
 if TYPE_CHECKING:
@@ -39,8 +25,12 @@ if TYPE_CHECKING:
     from magtwin.sim.motion.commands import Commands
     from magtwin.sim.motion.controllers import Controller
     from magtwin.sim.motion.engine import Engine
-    from magtwin.sim.runs.simulate import Predict
+    from magtwin.sim.runs.simulate import Finish, Sensed
     from magtwin.sim.sensors.lidar import Scans
+
+
+_ON_STAGE = {"newton": "magtwin.twin.physics:newton"}
+"""Engines that need the stage, and what makes them of a twin."""
 
 
 def simulate(
@@ -88,8 +78,7 @@ def simulate(
         model_error: Whether readings of a neural magnetometer include model error; see `open_twin`.
         lidar: Whether the LiDAR follows its schedule, or stays on or off.
         outside: What the map reads outside its extent: nan, the nearest value inside, or an error.
-        controller: "follower", "release", "stanley" or "pure_pursuit", or a custom
-            `magtwin.sim.motion.controllers.Controller`.
+        controller: "follower" or "release", or a custom `magtwin.sim.motion.controllers.Controller`.
         engine: "kinematic"; "newton" for physics in the stage (`magtwin[physics]`); the name of a registered
             engine; or a custom `magtwin.sim.motion.engine.Engine`.
         sensors: Custom sensors: names of registered sensors, or functions that make a sensor. Their columns
@@ -116,14 +105,6 @@ def simulate(
     check_field(twin.scene, twin.field)
     path = drive_input(path, room_of(twin))
     check_commands(path, twin.magnetometer)
-    reads: list[Read] = []
-    sha256, driven = scene_sha256(twin.scene), path_metadata(path)
-
-    def complete(block: Run) -> Run:
-        read = reads.pop() if reads else None
-        known: Any = {"seed": seed, "duration_s": duration_s, "config_sha256": sha256}
-        return finished(twin, block, driven, read, **known)
-
     run = run_scene(
         twin.scene,
         path,
@@ -132,8 +113,8 @@ def simulate(
         speed=speed,
         duration_s=duration_s,
         rate_hz=rate_hz,
-        disturbance_nt=_predict(twin, reads),
-        model_error=model_error_of(twin, seed),
+        network=twin.magnetometer is not None,
+        finish=finisher(twin, path, seed, duration_s),
         outside=outside,
         lidar=lidar,
         obstacles=twin.obstacles,
@@ -141,118 +122,11 @@ def simulate(
         engine=engine_named(engine, twin, progress=progress) if isinstance(engine, str) else engine,
         sensors=sensors,
         interference=interference,
-        complete=complete,
         progress=progress,
         each=each,
     )
     check_read(run, twin.field)
     return run
-
-
-def simulate_robots(
-    twin: Twin | Scene | str | FilePath,
-    paths: "Mapping[str, Path | Commands | Run | str | FilePath | ArrayLike] | None" = None,
-    *,
-    robots: Iterable[str] | None = None,
-    meet: Literal["refuse", "flag"] = "refuse",
-    seed: int = 0,
-    session: Session | None = None,
-    plant: PlantSpec | str | None = None,
-    speed: float = 0.2,
-    duration_s: float | None = None,
-    rate_hz: float | None = None,
-    network: str | FilePath | None = None,
-    magnetometer: Kind | None = None,
-    model_error: bool = True,
-    lidar: Literal["schedule", "on", "off"] = "schedule",
-    outside: Literal["nan", "clamp", "raise"] = "nan",
-    controller: str = "follower",
-    progress: Callable[[int, int, str], Any] | None = None,
-    each: Callable[[str, Run], Any] | None = None,
-) -> dict[str, Run]:
-    """Drive all robots of a scene at the same time. Each robot gets a Run.
-
-    Each magnetometer also reads the iron of the other robots. The first robot draws what `simulate` draws
-    with the same seed; each other robot has a generator of its own.
-
-    Args:
-        twin: An opened twin, a `Scene`, or the file of a stage.
-        paths: What each robot drives, by name, as for `simulate`. Default: the path in the scene, else
-            "figure8".
-        robots: Names of the robots whose sensors are read. Default: all. All robots drive.
-        meet: What happens where footprints overlap: "refuse" raises an error with time and place; "flag"
-            sets flag_bump of both robots, which then drive through each other.
-        seed: As for `simulate`.
-        session: As for `simulate`; each robot is drawn independently.
-        plant: As for `simulate`; each robot has constants of its own.
-        speed: As for `simulate`, of each robot.
-        duration_s: As for `simulate`, of each robot.
-        rate_hz: As for `simulate`.
-        network: As for `open_twin`, if `twin` is a file; of each robot.
-        magnetometer: As for `open_twin`, if `twin` is a file; of each robot.
-        model_error: As for `simulate`.
-        lidar: As for `simulate`.
-        outside: As for `simulate`.
-        controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`.
-        progress: As for `simulate`, of each long run in turn.
-        each: As for `simulate`, called with the robot's name and each block of its run.
-
-    Returns:
-        Runs by robot name, in the scene's order. The metadata of each also name the robot, the nearest other
-        robot, and the time and clearance of their closest approach.
-
-    Raises:
-        InputError: A name is not that of a robot, robots would meet, or `simulate` would refuse one of them.
-    """
-    from magtwin.sim.exact import check_field, check_read
-    from magtwin.sim.runs.multi_robot import simulate_robots as run_robots
-
-    seed = checked_seed(seed)
-    twin = opened(twin, network, magnetometer, model_error, "simulate_robots")
-    twin = in_session(with_plant(twin, plant), session, seed=seed)
-    check_field(twin.scene, twin.field)
-    placed = {other.robot.name: other for other in twin.scene.robots}
-    for name in (*(paths or {}), *(robots or ())):
-        find("robot", name, placed)
-    twins = {name: led_by(twin, name) for name in placed}
-    driven = {
-        name: drive_input((paths or {}).get(name, robot.path or "figure8"), room_of(twins[name]))
-        for name, robot in placed.items()
-    }
-    for name, path in driven.items():
-        check_commands(path, twins[name].magnetometer)
-    reads: dict[str, list[Read]] = {name: [] for name in placed}
-    hashes = {name: scene_sha256(own.scene) for name, own in twins.items()}
-    paths_said = {name: path_metadata(path) for name, path in driven.items()}
-
-    def complete(name: str, block: Run) -> Run:
-        read = reads[name].pop() if reads[name] else None
-        known: Any = {"seed": seed, "duration_s": duration_s, "config_sha256": hashes[name]}
-        return finished(twins[name], block, paths_said[name], read, **known)
-
-    runs = run_robots(
-        twin.scene,
-        driven,
-        anomaly_map=twin.field,
-        rngs={name: np.random.default_rng((seed, 2, k) if k else seed) for k, name in enumerate(placed)},
-        wanted=[name for name in placed if robots is None or name in set(robots)],
-        meet=meet,
-        speed=speed,
-        duration_s=duration_s,
-        rate_hz=rate_hz,
-        obstacles=twin.obstacles,
-        controller=controller,
-        disturbances_nt={name: _predict(own, reads[name]) for name, own in twins.items()},
-        model_errors={name: model_error_of(twins[name], seed, which=k) for k, name in enumerate(placed)},
-        outside=outside,
-        lidar=lidar,
-        complete=complete,
-        progress=progress,
-        each=each,
-    )
-    for run in runs.values():
-        check_read(run, twin.field)
-    return runs
 
 
 def scan(twin: Twin | Scene | str | FilePath, run: Run, *, seed: int = 0) -> "Scans":
@@ -267,7 +141,7 @@ def scan(twin: Twin | Scene | str | FilePath, run: Run, *, seed: int = 0) -> "Sc
     from magtwin.sim.sensors.lidar import scans_of
 
     if not isinstance(twin, Twin):
-        twin = in_session_of(open_twin(twin, magnetometer="map-only"), run.metadata)
+        twin = in_session_of(opened(twin, None, "map-only", True, "scan"), run.metadata)
     rng = streams(np.random.default_rng(seed))["lidar"]
     return scans_of(run, twin.scene.robot, twin.obstacles, rng)
 
@@ -285,71 +159,49 @@ def engine_named(
     Raises:
         InputError: No engine has that name, or it is not installed; the text names the extra.
     """
-    from magtwin.sim.engines.newton import Newton, check_installed
     from magtwin.sim.motion.engine import ENGINES
 
-    find("engine", name, dict.fromkeys([*ENGINES, "newton"]))
-    if name != "newton":
+    find("engine", name, dict.fromkeys([*ENGINES, *_ON_STAGE]))
+    if name not in _ON_STAGE:
         return ENGINES[name]
-    check_installed()
-    placed, robot = "", twin.scene.robot
-    if {"lab", "lab_pose"} & twin.metadata.keys():
-        from magtwin.usd.scene import as_layer, open_alone
-
-        placed = as_layer(open_alone(twin.scene_file, robot.name, lab=str(twin.metadata.get("lab", ""))))
-    return Newton(twin.scene_file, robot, progress, placed=placed)
+    module, _, function = _ON_STAGE[name].partition(":")
+    engine: Engine = getattr(importlib.import_module(module), function)(twin, progress)
+    return engine
 
 
-def path_metadata(path: "Path | Commands | Run | str") -> Metadata:
-    """File and checksum of what was driven."""
-    if isinstance(path, str):
-        return {}
-    if isinstance(path, Run):
-        arrays: Iterable[NDArray[Any]] = (array for _, array in sorted(path.items()))
-        kind, file = "replay", ""
-    elif isinstance(path, Path):
-        arrays, kind, file = (path.p_xy, np.array([path.closed])), "path", path.file
-    else:
-        arrays, kind, file = (path.rows,), "commands", path.file
-    metadata: Metadata = {f"{kind}_file": file} if file else {}
-    if isinstance(path, Path) and path.placing:
-        metadata["path_placing"] = " ".join(map(repr, path.placing))
-    checksum = hashlib.sha256()
-    for array in arrays:
-        checksum.update(np.ascontiguousarray(array).tobytes())
-    return {**metadata, f"{kind}_sha256": checksum.hexdigest()}
+def stated(twin: Twin, run: Run, read: "Read | None", *, add: bool = True) -> Run:
+    """A run with what its network states of each reading; `add`: columns that the run lacks, too."""
+    if read is None:
+        return run
+    spec = twin.scene.robot.magnetometer
+    noise = spec.noise_density_nt * np.sqrt(float(run.metadata["rate_hz"]) / 2)
+    columns: dict[str, NDArray[Any]] = {"b_sd_nt": np.hypot(read.stated_sd_nt, noise)}
+    if read.outside is not None:
+        columns["flag_out_of_distribution"] = read.outside
+    return run.with_columns(**{name: array for name, array in columns.items() if add or name in run})
 
 
 def finished(
     twin: Twin,
     run: Run,
-    path: "Path | Commands | Run | str | Metadata",
+    path: Metadata,
     read: "Read | None",
     *,
     seed: int,
     duration_s: float | None,
-    config_sha256: str | None = None,
-    add: bool = True,
+    config_sha256: str,
 ) -> Run:
-    """A run with the columns that its network adds and the metadata that reproduce it.
+    """A run with the metadata that reproduce it.
 
     Args:
         twin: The twin in its session.
         run: What the simulator made.
-        path: What was driven, or what `path_metadata` gave for it.
+        path: What `path_metadata` gave for what was driven.
         read: What the network read. None without a network.
         seed: Seed of the run.
         duration_s: Duration that was asked for [s].
-        config_sha256: `scene_sha256` of the twin's scene, if it is known already.
-        add: Whether to add columns that the run lacks, or only replace those that it has.
+        config_sha256: `scene_sha256` of the twin's scene.
     """
-    if read is not None:
-        spec = twin.scene.robot.magnetometer
-        noise = spec.noise_density_nt * np.sqrt(float(run.metadata["rate_hz"]) / 2)
-        columns: dict[str, NDArray[Any]] = {"b_sd_nt": np.hypot(read.stated_sd_nt, noise)}
-        if read.outside is not None:
-            columns["flag_out_of_distribution"] = read.outside
-        run = run.with_columns(**{name: array for name, array in columns.items() if add or name in run})
     metadata: Metadata = {"magtwin": __version__, "numpy": np.__version__, "seed": seed}
     if duration_s is not None:
         metadata["asked_duration_s"] = float(duration_s)
@@ -357,10 +209,8 @@ def finished(
         metadata["plant"] = OF_SCENE  # unless the twin's metadata name another
     if read is not None and read.intervals != OWN:
         metadata["network_intervals"] = read.intervals
-    driven = path if isinstance(path, dict) else path_metadata(path)
-    metadata |= dict(twin.session) | driven | dict(twin.metadata)
-    metadata["config_sha256"] = config_sha256 or scene_sha256(twin.scene)
-    return run.with_metadata(**metadata)
+    metadata |= dict(twin.session) | path | dict(twin.metadata)
+    return run.with_metadata(**{**metadata, "config_sha256": config_sha256})
 
 
 def check_commands(path: "Path | Commands | Run | str", network: "NeuralMagnetometer | None") -> None:
@@ -376,15 +226,34 @@ def check_commands(path: "Path | Commands | Run | str", network: "NeuralMagnetom
             )
 
 
-def _predict(twin: Twin, reads: "list[Read]") -> "Predict | None":
-    """A function that predicts the disturbance of a run and appends what the network read to `reads`."""
-    network, known = twin.magnetometer, [trained_on(twin)]
-    if network is None:
-        return None
+def reader(twin: Twin, seed: int, *, which: int = 0) -> "Callable[[Sensed], tuple[Run, Read | None]]":
+    """What reads the magnetometer of runs, or of blocks, in which all else has been sensed.
 
-    def predict(run: Run) -> tuple[NDArray[Any], NDArray[Any]]:
-        (read,) = network.read([run], known=known)
-        reads.append(read)
-        return read.disturbance_nt, read.sd_nt
+    `which` is the place of the robot in its scene.
+    """
+    network, trained = twin.magnetometer, trained_on(twin)
+    error = model_error_of(twin, seed, which=which)
 
-    return predict
+    def read_in(sensed: "Sensed") -> tuple[Run, "Read | None"]:
+        if network is None:
+            return sensed.read(), None
+        if not sensed.run.rows:
+            return sensed.read((np.zeros(0), np.zeros(0)), error), None
+        (read,) = network.read([sensed.run], known=[trained])
+        return stated(twin, sensed.read((read.disturbance_nt, read.sd_nt), error), read), read
+
+    return read_in
+
+
+def finisher(
+    twin: Twin, path: DriveInput, seed: int, duration_s: float | None, *, which: int = 0
+) -> "Finish":
+    """What makes whole runs of those that a twin's robot has sensed; `which` as for `reader`."""
+    read_in, driven = reader(twin, seed, which=which), path_metadata(path)
+    known: Any = {"seed": seed, "duration_s": duration_s, "config_sha256": scene_sha256(twin.scene)}
+
+    def finish(sensed: "Sensed") -> Run:
+        run, read = read_in(sensed)
+        return finished(twin, run, driven, read, **known)
+
+    return finish

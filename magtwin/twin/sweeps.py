@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import math
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path as FilePath
@@ -15,24 +14,13 @@ from magtwin.errors import InputError, RepairWarning
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.path import Path
 from magtwin.run.run import Run
-from magtwin.sim.motion.drive_input import drive_inputs
+from magtwin.sim.motion.drive_input import drive_inputs, path_metadata
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
-from magtwin.twin.opening import opened
-from magtwin.twin.simulation import check_commands, finished
-from magtwin.twin.twin import (
-    Kind,
-    Twin,
-    checked_seed,
-    in_session,
-    model_error_of,
-    room_of,
-    scene_sha256,
-    trained_on,
-    with_plant,
-    without_model_error,
-)
+from magtwin.twin.session import in_session, model_error_of, room_of, trained_on, with_plant
+from magtwin.twin.simulation import check_commands, finished, stated
+from magtwin.twin.twin import Kind, Twin, checked_seed, opened, scene_sha256, without_model_error
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer
@@ -120,6 +108,7 @@ def sweep(
     from magtwin.sim.exact import check_field
     from magtwin.sim.runs.batch import BLOCK, Job, Runs
     from magtwin.sim.runs.sensing import Conditions
+    from magtwin.sim.runs.simulate import check_asked
 
     twin = opened(twin, network, magnetometer, model_error, "sweep")
     if plant is not None and robots is not None:
@@ -158,10 +147,7 @@ def sweep(
         check_commands(path, twin.magnetometer)
         jobs.append(Job(own.scene, path, number, speed))
     predictor = twin.magnetometer
-    if duration_s is not None and not 0 < duration_s < math.inf:
-        raise InputError(
-            f"duration_s must be above 0 s and finite, got {duration_s!r}", parameter="duration_s"
-        )
+    check_asked(duration_s, rate_hz)
     finish = _Finish(predictor, twin.field, tuple(known.values()), duration_s)
     conditions = Conditions(
         anomaly_map=twin.field,
@@ -205,8 +191,9 @@ class _Finish:
             )
             if check:
                 self.check(run)
-            options: Any = {"duration_s": self.duration_s, "config_sha256": config, "add": False}
-            runs.append(finished(own, run, job.path, read, seed=job.seed, **options))
+            options: Any = {"duration_s": self.duration_s, "config_sha256": config}
+            run = stated(own, run, read, add=False)
+            runs.append(finished(own, run, path_metadata(job.path), read, seed=job.seed, **options))
         return runs
 
     def check(self, run: Run) -> None:

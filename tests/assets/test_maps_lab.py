@@ -13,8 +13,8 @@ from magtwin.field.sources.magnets import body_of
 from magtwin.files.file import shipped
 from magtwin.files.settings import read_toml
 from magtwin.path import path_named
+from magtwin.sim.at_rest import field_at_rest_nt
 from magtwin.sim.runs.simulate import simulate
-from magtwin.sim.survey import field_at_rest_nt
 from magtwin.usd.maps.layer import load_map
 
 LAB = shipped("maps", "lab")

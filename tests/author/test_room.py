@@ -18,7 +18,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.bodies import Bodies
 from magtwin.field.sources.magnets import body_of
 from magtwin.files.file import shipped
-from magtwin.sim.survey import field_at_rest_nt
+from magtwin.sim.at_rest import field_at_rest_nt
 from magtwin.spec.furniture import (
     KINDS,
     FurnitureSpec,

@@ -18,9 +18,10 @@ from magtwin.errors import InputError
 from magtwin.io.rerun.live import streamed
 from magtwin.io.rerun.viewer import live_viewer
 from magtwin.io.tables import read_parquet
+from magtwin.sim.motion.closed_loop import Chassis
 from magtwin.sim.motion.commands import read_commands
-from magtwin.sim.motion.follow import play
-from magtwin.sim.motion.manual import Gamepad, Keyboard, Recorder, at_start
+from magtwin.sim.motion.follow import STAND, loop_by_commands, play
+from magtwin.sim.motion.manual import Gamepad, Keyboard, Recorder
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.twin import open_twin
@@ -68,23 +69,18 @@ def test_a_stick_drives_in_proportion_and_start_ends():
 def test_commands_of_a_manual_drive_drive_it_again_to_the_last_bit():
     keys, errors = Keyboard(DRIVE), (0.002, -0.003)
     wall = Obstacles(("wall",), (np.array([[0.5, -1], [0.6, -1], [0.6, 1], [0.5, 1]]),))
-    chassis = at_start(DRIVE, (0.1, 0.0, 0.3), wall, 0.171, errors, 0.02)
-    recorder = Recorder(chassis, keys, 0.02)
+    start = {"start": (0.1, 0.0, 0.3), "footprint_radius_m": 0.171, "wheel_errors": errors}
+    chassis = Chassis(loop_by_commands(STAND, DRIVE, **start), wall)
+    recorder, poses, bumps = Recorder(chassis, keys, 0.02), [chassis.pose], []
     for k in range(400):
         if k % 10 == 0:
             keys.feed(np.random.default_rng(k).choice([b"w", b"w", b"a", b"d", b"x"]))
         recorder.step()
-    by_hand = chassis.motion()
-    again = play(
-        recorder.commands("c.csv").rows,
-        DRIVE,
-        start=(0.1, 0.0, 0.3),
-        obstacles=wall,
-        footprint_radius_m=0.171,
-        wheel_errors=errors,
-    )
-    assert by_hand.bump.any()
-    assert_array_equal(again.poses[: len(by_hand.poses)], by_hand.poses)
+        poses.append(chassis.pose)
+        bumps.append(chassis.bump)
+    again = play(recorder.commands("c.csv").rows, DRIVE, obstacles=wall, **start)
+    assert any(bumps)
+    assert_array_equal(again.poses[: len(poses)], poses)
     assert again.v[-1] == 0.0
 
 

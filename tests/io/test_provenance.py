@@ -119,7 +119,7 @@ def test_a_run_of_every_kind_comes_out_again_to_the_bit(twin, tmp_path):
     from magtwin.sim.motion.commands import read_commands
 
     runs = [
-        simulate(twin, "sine", seed=1, speed=0.15, controller="stanley", lidar="on", **BRIEF),
+        simulate(twin, "sine", seed=1, speed=0.15, controller="release", lidar="on", **BRIEF),
         simulate(twin, "A", seed=2, outside="clamp", **BRIEF),
         simulate(twin, tmp_path / "way.csv", seed=3, **BRIEF),
         simulate(twin, read_commands(tmp_path / "drive.csv"), seed=4, rate_hz=20.0),

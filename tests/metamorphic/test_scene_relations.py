@@ -11,9 +11,10 @@ from relations import rotation, turned_map
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import quat_from_yaw
 from magtwin.path.polyline import Path as Way
+from magtwin.sim.at_rest import field_at_rest_nt
 from magtwin.sim.interference import ambient_field_nt
 from magtwin.sim.runs.simulate import simulate
-from magtwin.sim.survey import field_at_rest_nt, survey_readings
+from magtwin.sim.survey import survey_readings
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
 from magtwin.spec.robot import RobotSpec

@@ -97,8 +97,11 @@ def test_what_is_recorded_over_ros_is_the_direct_run_of_its_commands(driven: Dri
         rng=np.random.default_rng(SEED),
         duration_s=DURATION_S,
         lidar="on",
-        disturbance_nt=lambda run: (net.read([run])[0].disturbance_nt, net.read([run])[0].sd_nt),
-        model_error=model_error_of(twin, SEED),
+        network=True,
+        finish=lambda sensed: sensed.predicted(
+            lambda run: (net.read([run])[0].disturbance_nt, net.read([run])[0].sd_nt),
+            model_error_of(twin, SEED),
+        ),
         obstacles=twin.obstacles,
     )
     run = driven.run

@@ -1,13 +1,12 @@
 """Two runs laid over each other."""
 
-import json
 import math
 
 import numpy as np
 import pytest
 
 from magtwin.errors import InputError
-from magtwin.run.compare import compare, driven_m, errors_of
+from magtwin.run.compare import compare, errors_of
 from magtwin.run.run import Run
 
 
@@ -36,15 +35,6 @@ def test_the_offset_of_two_clocks_is_found_to_a_tenth_of_a_millisecond(late):
     assert figures(found)["b_measured_nt"].correlation > 0.999999
 
 
-def test_a_run_over_itself_differs_nowhere():
-    a = circle()
-    for align in ("time", "path", "none"):
-        found = compare(a, a, align=align)
-        assert found.shift == pytest.approx(0, abs=1e-9)
-        for one in found.agreements():
-            assert one.greatest < 1e-6, (align, one)
-
-
 def test_ahead_left_and_turned_are_told_apart():
     a = circle(radius=1.0)
     inside = circle(radius=1.0, aside_m=0.05)  # counter-clockwise, so inside is to the left
@@ -65,27 +55,6 @@ def test_speeds_that_differ_drift_apart_in_time_and_agree_along_the_path():
     assert by_path.unit == "m"
 
 
-def test_a_later_start_on_the_path_is_found_by_length():
-    found = compare(circle(seconds=20), circle(speed=0.3, seconds=20, at_s=2.0), align="path")
-    assert found.shift == pytest.approx(0.6, abs=0.01)
-
-
-def test_a_constant_difference_of_field_is_its_mean_its_rms_and_its_greatest():
-    found = figures(compare(circle(), circle(offset_nt=-120.0)))["b_measured_nt"]
-    assert found.mean == pytest.approx(-120, abs=0.01)
-    assert found.rms == pytest.approx(120, abs=0.01)
-    assert found.mae == pytest.approx(120, abs=0.01)
-    assert found.correlation == pytest.approx(1.0, abs=1e-6)
-
-
-def test_a_standing_robot_drives_no_path_however_its_pose_trembles():
-    rng = np.random.default_rng(1)
-    still = 0.001 * rng.standard_normal((5000, 2))
-    assert driven_m(still)[-1] < 0.05
-    straight = np.column_stack([np.linspace(0, 3, 5000), np.zeros(5000)]) + still
-    assert driven_m(straight)[-1] == pytest.approx(3.0, rel=0.03)
-
-
 def test_nothing_is_interpolated_across_a_gap():
     a = circle()
     b = circle()
@@ -93,15 +62,6 @@ def test_nothing_is_interpolated_across_a_gap():
     found = compare(a, Run({name: values[kept] for name, values in b.items()}), align="none")
     assert not ((found.at > 20.1) & (found.at < 29.9)).any()
     assert figures(found)["along-track"].greatest < 1e-6
-
-
-def test_poses_that_are_unknown_in_places_are_left_out():
-    a = circle()
-    p = a["p_world_base"].copy()
-    p[100:200] = np.nan
-    found = compare(a.with_columns(p_world_base=p), circle(at_s=1.0))
-    assert found.shift == pytest.approx(1.0, abs=1e-4)
-    assert not np.isin(np.arange(100, 200), found.rows).any()
 
 
 def test_a_real_robots_run_without_truth_is_compared_by_motion_capture():
@@ -113,13 +73,6 @@ def test_a_real_robots_run_without_truth_is_compared_by_motion_capture():
     assert found.shift == pytest.approx(0.7, abs=1e-3)
     assert figures(found)["cross-track"].mean == pytest.approx(0.02, abs=1e-3)
     assert "heading" not in figures(found)
-
-
-def test_the_figures_are_json_for_scripts():
-    said = json.loads(compare(circle(), circle(at_s=1.0)).to_json())
-    assert said["align"] == "time"
-    assert said["shift"] == pytest.approx(1.0, abs=1e-4)
-    assert said["agreements"]["b_measured_nt"]["unit"] == "nT"
 
 
 @pytest.mark.parametrize(

@@ -78,16 +78,3 @@ def test_a_long_text_of_a_dictionary_counts_as_often_as_it_is_used(kind, tmp_pat
     write(200)
     with pytest.raises(InputError, match="that decode to"):
         check_parquet(path)
-
-
-def test_a_long_text_that_all_rows_share_is_refused(tmp_path):
-    path = tmp_path / "a.parquet"
-    texts = pa.DictionaryArray.from_arrays(np.zeros(2000, np.int32), ["x" * 1_000_000])
-    pq.write_table(pa.table({"s": texts}), path, compression="zstd")
-    with pytest.raises(InputError, match="bytes that decode to 2"):
-        check_parquet(path)
-
-
-def test_parts_of_columns_that_overlap_are_refused(path):
-    with pytest.raises(InputError, match="damaged Parquet"):
-        _check_pages(path, path.stat().st_size // 2)

@@ -1,10 +1,8 @@
 """The table of a Run."""
 
 import itertools
-import json
 import pickle
 import runpy
-import sys
 
 import numpy as np
 import pytest
@@ -56,42 +54,6 @@ def test_unequal_columns_and_wrong_shapes_are_refused():
         Run({"t": [0, 1], "yaw": [0, 1, 2]})
     with pytest.raises(InputError, match=r"'odom_p' must have shape \(2, 3\), got \(2, 2\)"):
         Run({"odom_p": np.zeros((2, 2))})
-
-
-def test_a_run_is_not_changed_in_place():
-    run = Run({"t": [0.0]}, {"seed": 1})
-    other = run.with_columns(yaw=np.array([1.0])).with_metadata(path="sine")
-    assert "yaw" not in run
-    assert list(other) == ["t", "yaw"]
-    assert dict(other.metadata) == {"seed": 1, "path": "sine"}
-    with pytest.raises(TypeError):
-        run.columns["t"] = np.zeros(1)
-
-
-def test_every_column_has_a_name_for_each_of_its_numbers():
-    for name, column in COLUMNS.items():
-        assert len(column.parts) == (column.width if column.width > 1 else 0), name
-        assert column.doc
-        assert name.endswith("_nt") == (column.unit == "nT"), name
-
-
-def test_the_report_counts_what_happened():
-    run = Run(
-        {
-            "t": [0, 1, 2],
-            "p_world_base": [[0, 0, 0], [3, 4, 0], [3, 4, 0]],
-            "b_total_nt": [40, 50, np.nan],
-            "b_truth_nt": [41, 53, np.nan],
-            "flag_bump": [False, True, False],
-        }
-    )
-    figures = {f.name: f for f in run.report().figures}
-    assert figures["distance driven"].value == 5
-    assert figures["b_total_nt"].value == 45
-    assert figures["b_total_nt"].spread == 5
-    assert figures["error"].value == 2
-    assert figures["flag_bump"].value == 1
-    assert json.loads(run.report("x").to_json())["figures"]["duration"] == {"value": 2.0, "unit": "s"}
 
 
 def test_the_figures_of_a_report_are_those_of_the_raw_arrays():
@@ -146,31 +108,6 @@ def test_to_pandas_has_a_column_a_part_with_units():
     assert frame.attrs["metadata"] == dict(run.metadata)
 
 
-def test_to_xarray_keeps_vectors_whole_with_named_parts_on_the_clock():
-    pytest.importorskip("xarray")
-    run = every_column()
-    data = run.to_xarray()
-    assert np.array_equal(data["t"], run["t"])
-    assert np.array_equal(data["p_world_base"].sel(x_y_z="y"), run["p_world_base"][:, 1])
-    assert data["imu_w"].attrs == {"units": "rad/s", "frame": "imu_link", "long_name": "gyroscope"}
-    assert data.attrs == dict(run.metadata)
-
-
-@pytest.mark.parametrize("module", ["pandas", "polars", "xarray"])
-def test_an_absent_library_is_refused_with_the_line_that_installs_it(module, monkeypatch):
-    monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(InputError, match=rf"{module} is not installed.*pip install 'magtwin\[{module}\]'"):
-        getattr(every_column(), f"to_{module}")()
-
-
-def test_to_polars_has_a_column_a_part():
-    pytest.importorskip("polars")
-    run = every_column()
-    frame = run.to_polars()
-    assert frame.columns == list(run.flat())
-    assert np.array_equal(frame["wheel_angle_right"].to_numpy(), run["wheel_angle"][:, 1])
-
-
 def test_select_keeps_the_clock_and_takes_patterns_in_the_order_asked():
     run = every_column()
     assert list(run.select("yaw", "b_t*")) == ["t", "yaw", "b_total_nt", "b_truth_nt"]
@@ -193,16 +130,6 @@ def test_slices_by_time_put_together_are_the_run(cuts):
             parts.append(run.between(a, b))
             assert np.array_equal(parts[-1]["t"], t[rows])
     assert_same(Run.concat(parts), run)
-
-
-def test_a_time_without_rows_is_refused_with_where_the_run_is():
-    run = Run({"t": [1.0, 2.0]})
-    with pytest.raises(InputError, match="no row from 3 to 4 s; the run goes from 1 to 2 s"):
-        run.between(3, 4)
-    with pytest.raises(InputError, match="start_s must be before end_s, got 4 and 3"):
-        run.between(4, 3)
-    with pytest.raises(InputError, match="start_s must be before end_s, got nan"):
-        run.between(float("nan"), 3)
 
 
 def test_a_run_read_at_its_own_instants_is_itself_to_the_bit():
@@ -257,18 +184,6 @@ def test_a_rate_gives_instants_from_the_start_none_after_the_end():
     assert run.resample(rate_hz=10).metadata["derived"] == "resample(rate_hz=10)"
 
 
-def test_another_rule_can_be_asked_for_a_column():
-    run = Run({"t": [0.0, 1.0], "odom_p": [[0, 0, 0], [2, 0, 0]], "flag_bump": [False, True]})
-    assert run.resample([0.5])["odom_p"][0, 0] == 0
-    assert run.resample([0.5], interpolation={"odom_p": "linear"})["odom_p"][0, 0] == 1
-    with pytest.raises(InputError, match="'flag_bump' holds flags, which are held, not linear"):
-        run.resample([0.5], interpolation={"flag_bump": "linear"})
-    with pytest.raises(InputError, match=r"'odom_p' has rows of shape \(3,\), not quaternions"):
-        run.resample([0.5], interpolation={"odom_p": "quaternion"})
-    with pytest.raises(UnknownNameError, match="no interpolation 'cubic'"):
-        run.resample([0.5], interpolation={"odom_p": "cubic"})
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -286,26 +201,6 @@ def test_another_rule_can_be_asked_for_a_column():
 def test_instants_that_no_run_can_be_read_at_are_refused(options, message):
     with pytest.raises(InputError, match=message):
         Run({"t": [0.0, 1.0, 2.0]}).resample(**options)
-
-
-def test_a_joined_run_is_held_causally_on_the_clock_of_the_first():
-    run = Run({"t": [1.0, 2.0, 3.0, 4.0], "yaw": np.zeros(4)}, {"seed": 1})
-    other = Run({"t": [0.5, 2.0, 3.5], "yaw": [5, 6, 7], "flag_bump": [True, False, True]}, {"seed": 2})
-    both = run.join(other, "_b")
-    assert np.array_equal(both["yaw_b"], [5, 6, 6, 7])
-    assert np.array_equal(both["flag_bump_b"], [True, False, False, True])
-    assert both.spec("yaw_b") == COLUMNS["yaw"]
-    assert both.metadata == {"seed": 1, "seed_b": 2, "derived": "join(_b)"}
-
-
-def test_a_run_that_does_not_cover_the_first_or_shares_names_is_refused():
-    run = Run({"t": [1.0, 2.0], "yaw": np.zeros(2)})
-    with pytest.raises(InputError, match=r"goes from 1\.5 to 3 s and does not cover this one"):
-        run.join(Run({"t": [1.5, 3.0]}))
-    with pytest.raises(InputError, match=r"goes from 0 to 0\.5 s and does not cover this one"):
-        run.join(Run({"t": [0.0, 0.5]}))
-    with pytest.raises(InputError, match="column 'yaw' is in both runs; give another suffix"):
-        run.join(run, "")
 
 
 def test_runs_that_do_not_run_on_are_refused_or_shifted():
@@ -331,14 +226,6 @@ def test_a_users_own_column_keeps_what_it_was_said_to_hold():
         assert other.spec("head_k") == spec
     assert run.with_columns(est_q_xyzw=np.zeros((2, 4))).spec("est_q_xyzw").interpolation == "quaternion"
     assert run.with_columns(flag_x=np.zeros(2, bool)).spec("flag_x").interpolation == "hold"
-
-
-def test_a_spec_that_does_not_fit_its_column_is_refused():
-    run = Run({"t": [0.0, 1.0], "head": np.zeros((2, 3))})
-    with pytest.raises(InputError, match="'head' has rows of 3 parts, but its spec names 2"):
-        run.with_specs(head=Column("K", "", "", 2, ("in", "out")))
-    with pytest.raises(InputError, match="'est_x' has rows of no parts, but its spec names 1"):
-        Run({"t": [0.0], "est_x": [1.0]}, {}, {"est_x": Column("", "", "", 1, ("a",))})
 
 
 def test_the_documented_columns_are_those_of_the_code():

@@ -52,19 +52,6 @@ def test_a_map_mirrored_in_the_room_contradicts_its_sources(lab, field):
         check_agrees(lab, mirrored, "here")
 
 
-def test_masked_nodes_do_not_count(lab, field):
-    values, valid = field.values_nt.copy(), np.ones(field.values_nt.shape, bool)
-    values[0, 0, :], valid[0, 0, :] = 35_650.0, False
-    found = contradiction_nt(lab, replace(field, values_nt=values, valid=valid))
-    assert found.rms_nt < 0.1
-    assert found.nodes == values.size - values.shape[2]
-
-
-def test_a_scene_without_sources_has_nothing_to_contradict(lab, field):
-    bare = replace(lab, sources=(), furniture=())
-    check_agrees(bare, replace(field, values_nt=field.values_nt[:, :, ::-1]), "here")
-
-
 def test_another_map_keeps_earth_sources_and_furniture_or_is_refused(lab, field, tmp_path):
     toml = shipped("scenes", "lab.toml")
     near = tmp_path / "near.usdc"
@@ -75,11 +62,3 @@ def test_another_map_keeps_earth_sources_and_furniture_or_is_refused(lab, field,
     save_map(replace(field, values_nt=field.values_nt[:, ::-1, :], name="far"), far)
     with pytest.raises(InputError, match=r"lab\.toml with .*far\.usdc: the map differs .* nT rms"):
         magtwin.scene_from_toml(toml, map_layer=far)
-
-
-def test_a_survey_in_place_of_a_map_is_refused_with_the_command_that_fits_it(tmp_path):
-    (tmp_path / "drive.csv").write_text("x,y,yaw,field\n0,0,0,41000\n")
-    with pytest.raises(
-        InputError, match=r"drive\.csv: .*not a map; .*magtwin map fit .*drive\.csv --out drive\.usdc"
-    ):
-        magtwin.scene_from_toml(shipped("scenes", "lab.toml"), map_layer=tmp_path / "drive.csv")

@@ -14,8 +14,7 @@ from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
 from magtwin.path import Path as Way
 from magtwin.path import path_named
 from magtwin.run.run import Run
-from magtwin.sim.exact import DIP, ExactField, check_field, check_read
-from magtwin.sim.interference import draw_platform
+from magtwin.sim.exact import check_field, check_read
 from magtwin.sim.runs.simulate import simulate
 from magtwin.sim.session import draw_session
 from magtwin.spec.drive import DriveSpec
@@ -117,12 +116,6 @@ def test_a_robot_without_magnetism_of_its_own_reads_exactly_the_map(field, harmo
     assert_allclose(np.linalg.norm(run["b_vector_nt"], axis=1), run["b_truth_nt"], rtol=1e-12)
 
 
-def test_iron_that_was_there_in_the_survey_is_not_added_to_a_map_of_several_headings():
-    iron = PlatformFieldSpec(hard_iron_nt=(3e3, -2e3, 1e3), soft_iron=PLATFORM.soft_iron)
-    run = drive(replace(SURVEYED, robot=replace(ROBOT, platform=iron)))
-    assert_array_equal(run["b_truth_nt"], run["b_map_nt"])
-
-
 def test_what_has_changed_since_the_survey_is_added_along_the_earths_direction():
     change = (-150.0, 220.0, 400.0)
     later = PlatformFieldSpec(hard_iron_nt=(3e3, -2e3, 1e3), hard_iron_change_nt=change)
@@ -149,14 +142,6 @@ def test_a_fit_that_is_far_off_the_earths_direction_is_not_believed(harmonic_map
     assert_array_equal(near["b_truth_nt"], drive(scene, harmonic_map)["b_truth_nt"])
     assert str(near.metadata["truth"]).endswith("direction of the field from the harmonic fit")
     assert "unchecked, as there is no [earth]" in str(drive(scene, wrong).metadata["truth"])
-
-
-def test_without_earth_and_fit_the_field_dips_by_60_deg_towards_y():
-    change = (0.0, 0.0, 500.0)
-    scene = replace(SURVEYED, robot=replace(ROBOT, platform=PlatformFieldSpec(hard_iron_change_nt=change)))
-    run = drive(scene)
-    assert_allclose(run["b_disturbance_nt"], -500 * np.sin(DIP), atol=2)
-    assert "assumed 60 deg down towards +y" in str(run.metadata["truth"])
 
 
 @pytest.mark.parametrize("layers", [1, 6])
@@ -188,48 +173,6 @@ def test_a_survey_alone_gives_what_the_sources_that_it_was_made_of_give(session,
     assert np.abs(off).max() < 20
     apart = np.linalg.norm(alone["b_vector_nt"] - exact["b_vector_nt"], axis=1)
     assert np.sqrt(np.mean(apart**2)) < 10
-
-
-def test_a_drawn_session_knows_what_has_changed_since_the_survey():
-    day = draw_platform(PLATFORM, np.random.default_rng(1))
-    change = np.subtract(day.hard_iron_nt, PLATFORM.hard_iron_nt)
-    assert_allclose(day.hard_iron_change_nt, change, rtol=1e-12)
-    assert np.linalg.norm(change) > 300
-    assert PLATFORM.hard_iron_change_nt == (0.0, 0.0, 0.0)
-
-
-def test_earth_without_sources_leaves_a_map_that_varies_the_truth():
-    of = {
-        "sources": [(KNOWN, MAP), (replace(KNOWN, sources=()), FLAT)],
-        "map": [(SURVEYED, MAP), (replace(SURVEYED, earth=EARTH), MAP), (replace(KNOWN, earth=None), MAP)],
-        "none": [(SURVEYED, FLAT)],
-    }
-    for said, cases in of.items():
-        for scene, field in cases:
-            assert ExactField(scene=scene, anomaly_map=field).of == said
-
-
-def test_a_run_says_that_the_map_is_its_truth_and_where_sources_are_it_does_not():
-    assert str(drive().metadata["truth"]).startswith("the fitted map; platform field from the robot's spec")
-    assert "truth" not in drive(KNOWN).metadata
-
-
-@pytest.mark.parametrize(("height", "says"), [(None, False), (0.34, False), (0.2, True)])
-def test_a_run_says_that_its_sensor_is_not_at_the_height_of_the_map(height, says):
-    run = drive(field=replace(MAP, height_m=height))
-    assert (
-        "it holds 0.2 m above the floor, and the sensor is at 0.36 m" in str(run.metadata["truth"])
-    ) == says
-
-
-def test_a_reading_off_the_map_is_nan():
-    small = replace(MAP, origin_m=(-0.5, -0.3), cell_m=(1 / 24, 0.6 / 14))
-    run = drive(field=small)
-    off = run["flag_outside_map"]
-    assert off.any()
-    assert not off.all()
-    assert_array_equal(np.isnan(run["b_total_nt"]), off)
-    assert_array_equal(np.isnan(run["b_truth_nt"]), off)
 
 
 def test_a_scene_of_a_constant_field_is_refused_with_what_to_do():

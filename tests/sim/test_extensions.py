@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from magtwin.errors import InputError
 from magtwin.path import path_named
 from magtwin.run.run import Column
 from magtwin.sim import extensions
@@ -56,14 +55,6 @@ def test_a_registered_sensor_adds_its_columns_and_changes_no_others(twin):
         assert_array_equal(run[name], plain[name], err_msg=name)
 
 
-def test_a_factory_is_taken_as_well_and_a_column_that_exists_is_refused(twin):
-    assert "speed_m_s" in run_of(twin, sensors=[Speedometer])
-    with pytest.raises(InputError, match="add the column 'speed_m_s', which exists already"):
-        run_of(twin, sensors=[Speedometer, "test_speedometer"])
-    with pytest.raises(InputError, match="no sensor 'test_speedometr'; did you mean 'test_speedometer'"):
-        run_of(twin, sensors=["test_speedometr"])
-
-
 def test_an_interference_term_is_added_to_the_field_at_the_sensor(twin):
     run, plain = run_of(twin, interference=["test_pump"]), run_of(twin)
     added = run["b_vector_nt"] - plain["b_vector_nt"]
@@ -72,15 +63,6 @@ def test_an_interference_term_is_added_to_the_field_at_the_sensor(twin):
     )
     assert_allclose(run["b_truth_nt"], np.linalg.norm(run["b_vector_nt"], axis=1))
     assert_allclose(run["b_total_nt"], run["b_truth_nt"])
-
-
-def test_interference_is_added_to_what_a_network_predicts(twin):
-    def none(run):
-        return np.zeros(run.rows)
-
-    off = run_of(twin, interference=[pump_nt], disturbance_nt=none)["b_disturbance_nt"]
-    assert np.ptp(off) > 100
-    assert np.abs(off).max() < 301
 
 
 def test_a_registered_controller_drives_by_its_name(twin):

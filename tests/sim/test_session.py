@@ -10,12 +10,10 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.features import FULL, features
 from magtwin.path import PATHS, path_named
 from magtwin.sim.runs.simulate import simulate
-from magtwin.sim.session import LEAST_CHARGE, SPEEDS, draw_session, draw_speed
-from magtwin.spec.drive import DriveSpec
+from magtwin.sim.session import draw_session, draw_speed
 from magtwin.spec.magnetics import EarthFieldSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
-from magtwin.spec.sensors import LidarSpec
 
 REAL = {
     "yaw_deg": (180.295, 101.551),
@@ -137,38 +135,3 @@ def test_a_session_draws_what_differs_from_day_to_day_and_nothing_else():
     assert robot.drive.odometry_scale[0] != robot.drive.odometry_scale[1]
     assert draw_session(ROBOT, np.random.default_rng(0)) == robot
     assert draw_session(ROBOT, np.random.default_rng(1)) != robot
-
-
-def test_the_runs_of_a_session_share_their_wheels_and_their_odometrys_errors():
-    exact = dataclasses.replace(
-        ROBOT,
-        drive=DriveSpec(localization_std_m=0.0, localization_yaw_std=0.0, localization_latency_s=0.0),
-    )
-    scene, robot = dataclasses.replace(SCENE, robot=exact), draw_session(exact, np.random.default_rng(0))
-    day = dataclasses.replace(scene, robot=robot)
-
-    def driven(scene: Scene, seed: int) -> np.ndarray:
-        way = path_named("figure8")
-        rng = np.random.default_rng(seed)
-        return simulate(scene, way, anomaly_map=MAP, rng=rng, duration_s=20.0)["odom_p"][-1]
-
-    first, second = driven(day, 1), driven(day, 2)
-    assert np.linalg.norm(first - second) < 1e-3  # delays differ by milliseconds of 0.2 m/s
-    assert np.linalg.norm(driven(scene, 1) - driven(scene, 2)) > 5e-3
-    assert robot.drive.wheel_errors != (0.0, 0.0)
-
-
-def test_no_session_is_beyond_what_a_spec_allows():
-    tired = dataclasses.replace(ROBOT, lidar=LidarSpec(on_s=0.0, off_s=0.0))
-    rng = np.random.default_rng(0)
-    sessions = [draw_session(tired, rng) for _ in range(500)]
-    assert min(s.battery.initial_fraction for s in sessions) == LEAST_CHARGE
-    assert all(s.lidar.phase_s == 0 for s in sessions)
-
-
-def test_speeds_are_the_real_ones_within_the_drives():
-    rng = np.random.default_rng(0)
-    speeds = [draw_speed(DriveSpec(), rng) for _ in range(1000)]
-    assert min(speeds) == pytest.approx(SPEEDS[0], abs=0.001)
-    assert max(speeds) == pytest.approx(SPEEDS[1], abs=0.001)
-    assert draw_speed(DriveSpec(v_max=0.1), rng) == 0.1

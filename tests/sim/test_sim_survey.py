@@ -7,13 +7,12 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
-from magtwin.field.maps.difference import difference
 from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.field.sources.magnets import body_of
 from magtwin.frames import quat_from_yaw, rotate
+from magtwin.sim.at_rest import field_at_rest_nt
 from magtwin.sim.interference import ambient_gradient_nt_m
-from magtwin.sim.survey import field_at_rest_nt, pose_error_nt2, survey, survey_readings
-from magtwin.spec.lab import LabSpec
+from magtwin.sim.survey import pose_error_nt2, survey, survey_readings
 from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
@@ -69,21 +68,6 @@ def test_motors_lidar_battery_and_eddy_currents_are_not_in_the_map():
     )
 
 
-def test_lookup_of_the_map_at_its_nodes_is_the_field_at_rest():
-    field = survey(scene(), rng=rng(), headings_rad=(0.3, 2.0, 4.0))
-    x, y = np.meshgrid(field.x_m, field.y_m)
-    p = np.stack([x, y], axis=-1)
-    assert_allclose(field.lookup(p, 2.0), field_at_rest_nt(scene(), p, 2.0), rtol=0, atol=1e-9)
-
-
-def test_a_finer_map_comes_nearer_to_the_field_by_the_square_of_its_spacing():
-    coarse, fine = (survey(scene(), rng=rng(), spacing_m=s) for s in (0.25, 0.125))
-    p = np.random.default_rng(1).uniform((-2.8, -1.6), (2.8, 1.6), (2_000, 2))
-    exact = field_at_rest_nt(scene(), p, 0.0)
-    off_coarse, off_fine = (np.sqrt(np.mean((m.lookup(p, 0.0) - exact) ** 2)) for m in (coarse, fine))
-    assert off_coarse / off_fine == pytest.approx(4, rel=0.15)
-
-
 def test_readings_have_the_sensors_noise_and_resolution_and_the_map_its_variance():
     noisy = scene(magnetometer=MagnetometerSpec(noise_density_nt=5.0 / np.sqrt(135 / 2), resolution_nt=0.5))
     exact = survey(scene(), rng=rng()).values_nt
@@ -93,20 +77,6 @@ def test_readings_have_the_sensors_noise_and_resolution_and_the_map_its_variance
         assert_allclose(field.variance_nt2, want, rtol=1e-12)
         # the variance of 1,500 samples is known to sqrt(2 / 1500) = 3.7 %; 4 sigma
         assert np.mean((field.values_nt - exact) ** 2) == pytest.approx(want, rel=0.15)
-
-
-def test_a_grid_that_does_not_divide_the_floor_stays_on_it_and_amid_it():
-    field = survey(replace(scene(), lab=LabSpec(floor_m=(2.0, 1.1))), rng=rng(), spacing_m=0.3)
-    assert_allclose(field.extent, (-0.9, 0.9, -0.45, 0.45), atol=1e-12)
-
-
-def test_heights_and_shapes_are_broadcast():
-    p = np.zeros((3, 1, 3))
-    p[..., 2] = [[0.0], [0.1], [0.2]]
-    got = field_at_rest_nt(scene(), p, np.zeros(4))
-    assert got.shape == (3, 4)
-    assert_allclose(got[0], field_at_rest_nt(scene(), (0.0, 0.0), 0.0))
-    assert abs(got[1, 0] - got[0, 0]) > 1
 
 
 # Readings, and the twin as it stands
@@ -121,13 +91,6 @@ def test_readings_stand_on_their_nodes_and_are_the_maps_values():
     assert_array_equal(read.yaw, yaw.ravel())
     assert_array_equal(read.b_nt, field.values_nt.ravel())
     assert read.height_m == field.height_m == 0.4
-
-
-def test_headings_that_deviate_are_recorded_and_read_as_they_are():
-    read = survey_readings(scene(), rng=rng(), spacing_m=0.5, heading_error_rad=0.1)
-    nominal = np.asarray(read.grid.headings_rad)[read.node[:, 0]]
-    assert np.std(read.yaw - nominal) == pytest.approx(0.1, rel=0.15)
-    assert_allclose(read.b_nt, field_at_rest_nt(scene(), read.p_xy, read.yaw), rtol=0, atol=1e-9)
 
 
 def test_places_that_deviate_are_not_recorded():
@@ -145,26 +108,6 @@ def test_places_that_deviate_are_not_recorded():
     ]
     want = 0.02 * np.sqrt(np.mean(np.square(slope[0]) + np.square(slope[1])))
     assert np.sqrt(np.mean(off**2)) == pytest.approx(want, rel=0.2)
-
-
-def test_a_survey_at_another_height_is_the_field_there():
-    low, high = (
-        survey(scene(), rng=rng(), spacing_m=0.5, height_m=0.1),
-        survey(scene(), rng=rng(), spacing_m=0.5),
-    )
-    p, yaw = low.grid.poses()
-    assert_allclose(low.values_nt, field_at_rest_nt(scene(), p, yaw, height_m=0.1), rtol=0, atol=1e-9)
-    assert low.height_m == 0.1
-    assert np.ptp(low.values_nt) > 1.5 * np.ptp(high.values_nt)
-
-
-def test_a_survey_tells_frame_datum_and_figures():
-    field = survey(scene(), rng=rng(), spacing_m=0.5, readings=3)
-    assert field.frame == "world: x east, y north, z up"
-    assert "29.65 deg N, -82.35 deg E, 50 m" in field.datum
-    assert field.parameters == {"readings": 3, "noise_std_nt": 0.0, "resolution_nt": 0.0}
-    turned = replace(scene(), earth=replace(EARTH, north_deg=30.0))
-    assert "true north 30 deg" in survey(turned, rng=rng(), spacing_m=0.5).frame
 
 
 @pytest.mark.parametrize(
@@ -249,12 +192,6 @@ def test_a_sensor_that_loses_lock_latches_along_its_rows_and_those_nodes_are_mas
         assert not latched[layer][steep < 3e3].any()
 
 
-# Variance, and what a difference makes of it
-
-ERRORS = {"position_error_m": 0.01, "heading_error_rad": np.radians(2)}
-TWO = (0.0, np.pi)
-
-
 def test_the_variance_of_a_node_is_the_mean_square_of_what_errors_of_the_pose_do_there():
     errors = {"position_error_m": 0.03, "heading_error_rad": np.radians(8)}
     iron = PlatformFieldSpec(hard_iron_nt=(400.0, -250.0, 900.0))
@@ -270,62 +207,3 @@ def test_the_variance_of_a_node_is_the_mean_square_of_what_errors_of_the_pose_do
     ratio = np.mean(off**2, axis=0) / got
     assert ratio.mean() == pytest.approx(1, abs=0.03)
     assert np.abs(ratio - 1).max() < 5 * np.sqrt(2 / times)  # as known as a mean of squares of normals
-
-
-def test_a_sensor_above_the_robots_middle_has_a_finite_error_of_heading_alone():
-    middle = scene(p_base_magnetometer=(0.0, 0.0, 0.4))
-    field = survey(middle, rng=rng(), heading_error_rad=0.03)
-    assert np.isfinite(field.variance_nt2).all()
-
-
-def test_errors_of_the_pose_are_in_the_maps_variance_and_none_where_there_are_none():
-    noise = MagnetometerSpec(noise_density_nt=5.0 / np.sqrt(135 / 2), resolution_nt=0.0)
-    plain, wandering = (survey(scene(magnetometer=noise), rng=rng(), **e) for e in ({}, ERRORS))
-    assert_allclose(plain.variance_nt2, 25, rtol=1e-12)
-    want = pose_error_nt2(scene(), wandering.grid, 0.4, **ERRORS) + 25
-    assert_allclose(wandering.variance_nt2, want, rtol=1e-12)
-    assert wandering.parameters["position_error_m"] == 0.01
-
-
-@pytest.fixture(scope="module")
-def lab(lab_scene):
-    from magtwin.usd.scene import read_scene
-
-    return read_scene(lab_scene, check_network=False)
-
-
-@pytest.fixture(scope="module")
-def surveys(lab):
-    return [survey(lab, rng=np.random.default_rng(seed), headings_rad=TWO, **ERRORS) for seed in range(5)]
-
-
-def test_two_surveys_of_one_lab_differ_by_their_variance_and_raise_no_more_false_alarms_than_said(surveys):
-    found = [difference(a, b) for k, b in enumerate(surveys) for a in surveys[:k]]
-    spread = [np.sqrt(np.nanmean(d.z**2)) for d in found]
-    assert np.mean(spread) == pytest.approx(1, abs=0.05)
-    # with no change at all, the false-discovery rate is how often a node is called changed: 5 % of 10 pairs
-    assert sum(d.changed.any() for d in found) <= 2
-
-
-def test_a_desk_that_was_moved_is_marked_and_the_rest_of_the_lab_is_not(lab, surveys):
-    moved = replace(
-        lab,
-        furniture=tuple(
-            replace(f, p_world=(f.p_world[0] + 0.6, *f.p_world[1:])) if f.name == "desk_0" else f
-            for f in lab.furniture
-        ),
-    )
-    found = difference(surveys[0], survey(moved, rng=np.random.default_rng(99), headings_rad=TWO, **ERRORS))
-    desk = np.array([-1.9, 2.3])  # beyond the floor's edge at y = 1.75, 1.5 m wide before and after
-    p, _ = found.grid.poses()
-    near = np.linalg.norm(np.maximum(np.abs(p - desk - [0.3, 0]) - [1.05, 0.4], 0), axis=-1) < 1.5
-    assert found.changed[near].sum() >= 10
-    assert found.changed[~near].sum() <= 0.1 * found.changed.sum() + 3
-    assert max(abs(r.peak_m[0] - desk[0]) for r in found.regions[:2]) < 1.0
-    assert min(r.peak_m[1] for r in found.regions[:2]) > 1.0
-
-
-def test_readings_where_the_robot_cannot_stand_are_not_good():
-    read = survey_readings(scene(), rng=rng(), spacing_m=0.5, blocked=lambda p: p[..., 0] > 1.0)
-    assert 0 < read.good.sum() < len(read)
-    assert np.array_equal(read.good, read.p_xy[:, 0] <= 1.0)

@@ -229,8 +229,8 @@ def map_survey(
     jobs
         Number of processes that share the headings. Default: one, with several threads.
     """
+    from magtwin.files.kinds import scene_file
     from magtwin.io.surveys.maps import survey_scene
-    from magtwin.twin import scene_file
 
     scene = scene_file(scene)
     check_output(out, (*LAYERS, ".parquet"), "a map layer, or a file of readings,", force=force)

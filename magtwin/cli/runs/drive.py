@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force, Gamepad, Lab, MapLayer, ModelError, Network, Plant, Seed, Session
@@ -56,15 +56,17 @@ def drive(
     import numpy as np
 
     from magtwin.files.file import existing
+    from magtwin.files.kinds import scene_file
     from magtwin.files.outputs import output
     from magtwin.io.outputs import Outputs
     from magtwin.io.outputs import drive as drive_again
+    from magtwin.sim.motion.closed_loop import Chassis
     from magtwin.sim.motion.commands import write_commands
     from magtwin.sim.motion.drive import draw_wheel_errors
-    from magtwin.sim.motion.follow import CONTROL_RATE_HZ
-    from magtwin.sim.motion.manual import HELP, Gamepad, Keyboard, Recorder, at_start
+    from magtwin.sim.motion.follow import CONTROL_RATE_HZ, STAND, loop_by_commands
+    from magtwin.sim.motion.manual import HELP, Gamepad, Keyboard, Recorder
     from magtwin.sim.runs.sensing import streams
-    from magtwin.twin import in_session, open_twin, scene_file, with_plant
+    from magtwin.twin import in_session, open_twin, with_plant
 
     scene = scene_file(scene)
     if gamepad is not None and not gamepad.is_char_device():
@@ -77,9 +79,9 @@ def drive(
         twin = in_session(twin, session, seed=seed)
         robot, dt = twin.scene.robot, 1.0 / CONTROL_RATE_HZ
         errors = draw_wheel_errors(robot.drive, streams(np.random.default_rng(seed))["drive"])
-        chassis = at_start(
-            robot.drive, twin.scene.start, twin.obstacles, robot.footprint_radius_m, errors, dt
-        )
+        start: Any = {"start": twin.scene.start, "footprint_radius_m": robot.footprint_radius_m}
+        loop = loop_by_commands(STAND, robot.drive, wheel_errors=errors, **start)
+        chassis = Chassis(loop, twin.obstacles)
         hand: Hand = Keyboard(robot.drive) if gamepad is None else Gamepad(robot.drive)
         recorder = Recorder(chassis, hand, dt)
         with ExitStack() as stack:

@@ -90,7 +90,7 @@ def run(
     meet: Literal["refuse", "flag"] | None = None,
     engine: Literal["kinematic", "newton"] = "kinematic",
     replay: Path | None = None,
-    controller: Literal["follower", "release", "stanley", "pure_pursuit"] = "follower",
+    controller: Literal["follower", "release"] = "follower",
     sensing: SensingOptions = SENSING,
     seed: Seed = 0,
     session: Session = None,
@@ -134,8 +134,7 @@ def run(
         File of a run, in any format. The robot repeats the recorded motion; the sensors use the current
         settings.
     controller
-        follower (magtwin's own controller), release (that of APRILab's published package), stanley or
-        pure_pursuit.
+        follower (magtwin's own controller) or release (that of APRILab's published package).
     speed
         Forward speed on straight parts [m/s].
     duration_s
@@ -155,9 +154,9 @@ def run(
     pace
         Simulated seconds per second of the live display. Default: 1.
     """
+    from magtwin.files.kinds import scene_file
     from magtwin.io.outputs import Outputs, drive
     from magtwin.sim.runs.simulate import check_asked
-    from magtwin.twin import scene_file
     from magtwin.usd.scene import robots_in
 
     scene = scene_file(scene)
@@ -186,7 +185,7 @@ def run(
     ):
         if given:
             raise InputError(f"{option} {fault}, and {what} is none; drop one")
-    check_asked(speed, duration_s, sensing.rate_hz)
+    check_asked(duration_s, sensing.rate_hz, speed)
     if engine == "newton":
         from magtwin.sim.engines.newton import check_installed
 

@@ -86,11 +86,12 @@ def sweep(
     jobs
         Number of processes. Default: one, with several threads.
     """
+    from magtwin.files.kinds import scene_file
     from magtwin.files.outputs import check_free
     from magtwin.parallel import parse_shard
     from magtwin.sim.motion.drive_input import drive_input
     from magtwin.sim.runs.simulate import check_asked
-    from magtwin.twin import MIXTURE, open_twin, room_of, scene_file
+    from magtwin.twin import MIXTURE, open_twin, room_of
     from magtwin.twin import sweep as drive_many
     from magtwin.twin.sweeps import check_count
 
@@ -104,7 +105,7 @@ def sweep(
         if value is not None and value < least:
             raise InputError(f"--{name} must be a whole number from {least} up, got {value}")
     check_count(count)
-    check_asked(0.2 if speed is None else speed, duration_s, sensing.rate_hz)
+    check_asked(duration_s, sensing.rate_hz, 0.2 if speed is None else speed)
     if sessions is not None and session is not None:
         raise InputError("--session survey is one session; drop --sessions")
     check_free(out, force=force)

@@ -42,8 +42,8 @@ def export(
     """
     from magtwin.export.package import export_scene
     from magtwin.files.file import existing
+    from magtwin.files.kinds import scene_file
     from magtwin.files.outputs import check_free
-    from magtwin.twin import scene_file
 
     check_free(out, force=force)
     stage = scene_file(scene)

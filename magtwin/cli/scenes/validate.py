@@ -45,9 +45,9 @@ def validate(
 
     from magtwin.export.validation.validate import AGAINST
     from magtwin.export.validation.validate import validate as check
+    from magtwin.files.kinds import shipped_or
     from magtwin.files.outputs import output
     from magtwin.learn.data.features import FEATURES
-    from magtwin.twin import shipped_or
 
     check_output(out, (".json",), "a report", force=force)
 

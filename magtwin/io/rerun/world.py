@@ -18,7 +18,8 @@ from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
 from magtwin.spec.robot import RobotSpec
-from magtwin.twin import Twin
+from magtwin.twin.opening import geometry
+from magtwin.twin.twin import Twin
 from magtwin.usd.geometry import BASE_LINK, Link, Shape, srgb_from_linear
 from magtwin.usd.maps.heat_map import HEAT_MAP, HEAT_MAP_HEIGHT_M
 
@@ -99,7 +100,7 @@ class Interior:
         Raises:
             InputError: The stage cannot be read.
         """
-        shapes, links = twin.geometry()
+        shapes, links = geometry(twin)
         return cls(twin.scene.robot, shapes, links)
 
     def size(self, field: AnomalyMap) -> int:

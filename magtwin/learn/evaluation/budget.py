@@ -1,7 +1,7 @@
 """Error budget: how much of a model's error is map, lever arm, latency, sessions, platform and sensor.
 
 On a twin everything is known, so a model's error e = map + f - measured can be decomposed exactly. Let r be
-the field of the surveying robot at rest (`magtwin.sim.survey.field_at_rest_nt`), r' that of the robot in the
+the field of the surveying robot at rest (`magtwin.sim.at_rest.field_at_rest_nt`), r' that of the robot in the
 run's session, p the measured and aligned pose, p* the same with the true lever arm, and q the true pose:
 
     map         D1 = map(p) - r(p)              error of the map
@@ -111,7 +111,7 @@ class Truth:
 def at_rest_nt(scene: Scene, p_xy: Array, yaw: Array) -> Array:
     """Exact field magnitude at the magnetometer of a robot at rest with its LiDAR off [nT], shape (N,).
 
-    It is that of `magtwin.sim.survey.field_at_rest_nt` within 1e-3 nT; nan if the pose of base_link, (N, 2)
+    It is that of `magtwin.sim.at_rest.field_at_rest_nt` within 1e-3 nT; nan if the pose of base_link, (N, 2)
     [m] and (N,) [rad], is nan.
     """
     pose = np.column_stack([p_xy, yaw])

@@ -64,12 +64,7 @@ class Newton:
     def drive(
         self, closed_loop: ClosedLoop, controller: Controller | None, obstacles: Obstacles | None
     ) -> SampledMotion:
-        """As for `magtwin.sim.motion.engine.Engine`.
-
-        Raises:
-            InputError: Newton is not installed or cannot run the stage, the start touches an obstacle, a
-                command is not finite, or the robot falls over.
-        """
+        """As for `magtwin.sim.motion.engine.Engine`."""
         check_installed()
         obstacles = obstacles or Obstacles()
         closed_loop.check(obstacles)

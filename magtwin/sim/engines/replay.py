@@ -21,17 +21,8 @@ from magtwin.spec.drive import DriveSpec
 def replayed(run: Run, drive: DriveSpec) -> SampledMotion:
     """The motion that a Run recorded, from its first row on.
 
-    Args:
-        run: It needs t, p_world_base, and yaw or q_world_base_xyzw. Without v_base or w_base, speeds follow
-            from the poses. Without wheel_angle, the wheels roll without slip. Commands may be missing.
-        drive: The robot's wheels.
-
     Returns:
         The motion, one mean interval longer than the rows, so that it gives as many readings.
-
-    Raises:
-        InputError: A column is missing, there are fewer than two rows, times do not ascend, or a pose is not
-            finite; the text has the row.
     """
     lacking = [name for name in ("t", "p_world_base") if name not in run]
     if "yaw" not in run and "q_world_base_xyzw" not in run:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.errors import InputError
 from magtwin.sim.motion.drive import Moment, advance
 
 Array = NDArray[np.float64]
@@ -54,25 +53,6 @@ class SampledMotion:
     step_s: float | None = None
     """Length of the control steps, the first at 0, in which speeds are held [s]; None if speeds change evenly
     from sample to sample."""
-
-    def __post_init__(self) -> None:
-        count = len(self.t)
-        shapes = {"pose": (count, 3), "wheel_angle": (count, 2)}
-        for name in ("t", "pose", "v", "w", "wheel_angle", "v_cmd", "w_cmd", "bump"):
-            array = np.asarray(getattr(self, name), bool if name == "bump" else float)
-            if array.shape != shapes.get(name, (count,)):
-                raise InputError(
-                    f"{name} of a motion of {count} samples must have shape {shapes.get(name, (count,))}, "
-                    f"got {array.shape}"
-                )
-            object.__setattr__(self, name, array)
-        if self.step_s is not None and not self.has_steps(self.step_s):
-            raise InputError(f"a motion has no sample, or speeds that change, in a step of {self.step_s:g} s")
-        if count < 2 or self.t[0] != 0 or not np.all(np.diff(self.t) > 0):
-            raise InputError("a motion needs at least two samples in order of time, the first at 0 s")
-        for name in ("t", "pose", "v", "w", "wheel_angle"):
-            if not np.isfinite(getattr(self, name)).all():
-                raise InputError(f"{name} of a motion is not finite")
 
     def at(self, t: ArrayLike) -> Moment:
         """Pose, speeds and wheels at times `t`.

@@ -28,16 +28,7 @@ class WorldProcess:
         limit_s: float | None = None,
         files: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        """Prepare the process; the block starts it.
-
-        Args:
-            command: The program and its arguments.
-            job: Its first line, with the key `stage`.
-            engine: Name of the engine, for messages.
-            changes: What differs in its environment, as for `magtwin.files.children.environment`.
-            limit_s: Time after which the process is killed [s]. None for no limit.
-            files: Texts of files in the folder that it runs in, by name.
-        """
+        """Prepare the process; the block starts it."""
         self._command, self._job, self._engine = list(command), dict(job), engine
         self._changes, self._limit_s, self._files = changes, limit_s, files
 
@@ -69,11 +60,7 @@ class WorldProcess:
         self._held.close()
 
     def seen(self) -> list[float]:
-        """The next answer.
-
-        Raises:
-            InputError: The process ended, or took longer than its limit.
-        """
+        """The next answer."""
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
         if not line:

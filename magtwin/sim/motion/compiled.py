@@ -3,15 +3,20 @@
 from collections.abc import Callable
 from typing import Any
 
-from numba import types
+from numba import from_dtype, types
 
 from magtwin.compiled import compiled, inlined
 from magtwin.sim.motion import loop, walls
 
 _MATRIX = types.Array(types.float64, 2, "C")
 _NUMBERS = types.Array(types.int64, 1, "C")
+_DRIVES, _GAINS, _STATES = (
+    types.Array(from_dtype(kind), 1, "C") for kind in (loop.DRIVE, loop.GAINS, loop.STATE)
+)
 _SIGNATURE = (
     _NUMBERS,
+    _DRIVES,
+    _GAINS,
     _MATRIX,
     _MATRIX,
     _NUMBERS,
@@ -19,7 +24,7 @@ _SIGNATURE = (
     _MATRIX,
     _MATRIX,
     _NUMBERS,
-    _MATRIX,
+    _STATES,
     types.int64,
     types.int64,
     types.Array(types.float64, 3, "C"),
@@ -34,6 +39,7 @@ _CALLED: tuple[Callable[..., Any], ...] = (
     loop.perceived,
     walls.clearance,
     walls.free_way,
+    loop.way_open,
     loop.drive_on,
 )
 for _function in _IN_PLACE:

@@ -24,16 +24,9 @@ from magtwin.spec.drive import DriveSpec
 
 Array = NDArray[np.float64]
 
-CONTROLLERS: Mapping[str, int] = MappingProxyType(
-    {
-        "follower": loop.FOLLOWER,
-        "release": loop.RELEASE,
-        "stanley": loop.STANLEY,
-        "pure_pursuit": loop.PURE_PURSUIT,
-    }
-)
+CONTROLLERS: Mapping[str, int] = MappingProxyType({"follower": loop.FOLLOWER, "release": loop.RELEASE})
 """Built-in controllers that follow a path: magtwin's; that of the released package, which drives the real
-robot; Stanley's (Hoffmann et al. 2007); pure pursuit (Coulter 1992)."""
+robot."""
 
 RELEASE_GAIN = 0.5
 """k of the released follower [1/s], as published."""
@@ -43,9 +36,6 @@ LOST_M = 0.05
 
 CREEP = 0.01
 """Speed at the start and end of a piece [m/s]; one step of it is 0.2 mm."""
-
-AHEAD_M: Mapping[str, float] = MappingProxyType({"stanley": 0.06, "pure_pursuit": 0.15})
-"""Distance of Stanley's steered wheel ahead of the axle, and of pure pursuit's goal along the path [m]."""
 
 
 class Controller(Protocol):
@@ -90,8 +80,7 @@ class Guide:
     table: Array
     """The path or script, as `loop.drive_on` reads it, shape (loop.TABLE, M)."""
 
-    gains: tuple[float, float, float, float, float, float, float, float]
-    """As `loop.along_path` takes them."""
+    gains: loop.Gains
 
     timeout_s: float
     """Age at which a scripted command becomes invalid [s]."""
@@ -119,11 +108,11 @@ class Guide:
     @property
     def lost_m(self) -> float:
         """Distance from the path beyond which the robot counts as lost [m]."""
-        return math.sqrt(self.gains[5])
+        return math.sqrt(self.gains.lost2)
 
-    def gains_within(self, reach_m: float) -> tuple[float, float, float, float, float, float, float, float]:
+    def gains_within(self, reach_m: float) -> loop.Gains:
         """`gains` for poses that may be off by some distance [m]: the robot is lost only farther away."""
-        return (*self.gains[:5], (self.lost_m + reach_m) ** 2, *self.gains[6:])
+        return self.gains._replace(lost2=(self.lost_m + reach_m) ** 2)
 
     def command(self, t: float, x: float, y: float, yaw: float, v: float, w: float) -> tuple[float, float]:
         """As for `Controller`."""
@@ -145,26 +134,14 @@ class Guide:
 
 
 def guide_along(name: str, path: Path, drive: DriveSpec, *, speed: float, dt: float) -> Guide:
-    """A controller that follows a path.
-
-    Args:
-        name: One of `CONTROLLERS`.
-        path: Where to drive, as an open line.
-        drive: Its limits, and the lag of its motors, which all but "release" compensate.
-        speed: Wanted forward speed [m/s].
-        dt: Time between commands [s].
-
-    Raises:
-        UnknownNameError: No such controller; the text names the nearest one.
-        InputError: `speed` is out of range, or the path is too small.
-    """
+    """A controller that follows a path."""
     law = find("controller", name, CONTROLLERS)
     pieces = plan(drivable(path), drive, speed=speed)
     if law == loop.RELEASE:
         p = path.p_xy  # the release pursues the points of its file
         unused = np.zeros((loop.TABLE - 2, len(p)))
         (x, y), (dx, dy) = p[0].tolist(), (p[1] - p[0]).tolist()
-        gains = (dt, dt, speed, speed, 0.0, 0.0, 0.0, RELEASE_GAIN)
+        gains = loop.Gains(dt, delay=dt, speed=speed, creep=speed, towards=RELEASE_GAIN)
         return Guide(
             law, np.vstack([p.T, unused]), gains, drive.command_timeout_s, (x, y, math.atan2(dy, dx))
         )
@@ -178,15 +155,14 @@ def guide_along(name: str, path: Path, drive: DriveSpec, *, speed: float, dt: fl
         for row, column in zip(table, columns, strict=True):
             row[begin:end] = getattr(piece, column)
         end = begin
-    gains = (
+    gains = loop.Gains(
         dt,
-        dt + drive.motor_lag_s,
-        speed,
-        min(CREEP, speed),
-        2 * LIMIT_SHARE * drive.a_max,
-        (LOST_M + drive.v_max * dt) ** 2,
-        LIMIT_SHARE * drive.w_max,
-        AHEAD_M.get(name, 0.0),
+        delay=dt + drive.motor_lag_s,
+        speed=speed,
+        creep=min(CREEP, speed),
+        brake=2 * LIMIT_SHARE * drive.a_max,
+        lost2=(LOST_M + drive.v_max * dt) ** 2,
+        w_path=LIMIT_SHARE * drive.w_max,
     )
     x, y, yaw = table[:3, 0].tolist()
     return Guide(law, table, gains, drive.command_timeout_s, (x, y, yaw))
@@ -198,9 +174,6 @@ def guide_by_commands(commands: ArrayLike, drive: DriveSpec) -> Guide:
     Args:
         commands: Time since the start [s], forward speed [m/s] and yaw rate [rad/s] of each, shape (K, 3).
         drive: Its command_timeout_s ends a command.
-
-    Raises:
-        InputError: They have another shape, are not finite, or not in order of time; the text gives the row.
     """
     rows = np.asarray(commands, float)
     if rows.ndim != 2 or rows.shape[1] != 3 or not len(rows):
@@ -217,5 +190,4 @@ def guide_by_commands(commands: ArrayLike, drive: DriveSpec) -> Guide:
             f"t = {rows[i, 0]:g} s" + (f" after {rows[i - 1, 0]:g} s" if i else "")
         )
     table = np.vstack([rows.T, np.zeros((loop.TABLE - 3, len(rows)))])
-    none = (0.0,) * 8
-    return Guide(loop.COMMANDS, table, none, drive.command_timeout_s)  # type: ignore[arg-type]
+    return Guide(loop.COMMANDS, table, loop.Gains(), drive.command_timeout_s)

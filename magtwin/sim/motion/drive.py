@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.run import mapped
-from magtwin.sim.motion.loop import limited
+from magtwin.sim.motion.loop import Limits, limited
 from magtwin.spec.drive import DriveSpec
 
 Array = NDArray[np.float64]
@@ -45,12 +45,6 @@ def advance(pose: ArrayLike, v: ArrayLike, w: ArrayLike, duration: ArrayLike) ->
 def integrate_twist(v: ArrayLike, w: ArrayLike, dt: float, pose0: Pose = (0.0, 0.0, 0.0)) -> Array:
     """Poses of a unicycle under piecewise constant twists; each step as in `advance`.
 
-    Args:
-        v: Forward speeds [m/s], shape (K,).
-        w: Yaw rates [rad/s], shape (K,).
-        dt: Length of a step [s].
-        pose0: First x [m], y [m], yaw [rad] in world.
-
     Returns:
         x, y, yaw at the start and after each step, shape (K + 1, 3).
     """
@@ -70,17 +64,16 @@ def wheel_rates(v: ArrayLike, w: ArrayLike, drive: DriveSpec) -> Array:
     return np.stack([v - side, v + side], axis=-1) / drive.wheel_radius_m
 
 
-def limits(drive: DriveSpec, dt: float) -> tuple[float, float, float, float, float, float, float]:
-    """Limits of a drive for steps of `dt` [s], as arguments of `magtwin.sim.motion.loop.limited`."""
-    rim = drive.wheel_rate_max * drive.wheel_radius_m
-    return (
-        drive.v_max,
-        drive.w_max,
-        drive.a_max * dt,
-        drive.alpha_max * dt,
-        rim,
-        drive.wheel_separation_m / 2,
-        1 / drive.turning_radius_m if drive.turning_radius_m else math.inf,
+def limits(drive: DriveSpec, dt: float) -> Limits:
+    """Limits of a drive for steps of `dt` [s]."""
+    return Limits(
+        v_max=drive.v_max,
+        w_max=drive.w_max,
+        dv=drive.a_max * dt,
+        dw=drive.alpha_max * dt,
+        rim=drive.wheel_rate_max * drive.wheel_radius_m,
+        half=drive.wheel_separation_m / 2,
+        bend=1 / drive.turning_radius_m if drive.turning_radius_m else math.inf,
     )
 
 

@@ -1,9 +1,12 @@
 """DriveInput: what a robot can be told to drive, from a name, a file, points, a path, commands or a run."""
 
+import hashlib
+from collections.abc import Iterable
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.path import Path, resolve_path
@@ -18,15 +21,8 @@ DriveInput = Path | Commands | Run | str
 def drive_input(path: Any, room: Room | None = None, *, fit: bool = False) -> DriveInput:
     """Resolve the `path` argument of `magtwin.simulate`.
 
-    Args:
-        path: The name of a path, a CSV file, or points (N, 2) [m], which become a `Path`. "random", a `Path`,
-            `Commands` and a `Run` stay as they are.
-        room: Where it is driven: named paths are scaled to its floor, see `magtwin.path.path_in`.
-            Default: the floor for which they were designed.
-        fit: Whether a path that does not fit into the room is moved and shrunk until it does.
-
-    Raises:
-        InputError: There is no such path, no room for it, or it cannot be driven.
+    Names, CSV files and points become a `Path`. Named paths are scaled to the floor of a room, and `fit`
+    moves and shrinks any path until it is clear of what stands there.
     """
     if isinstance(path, Commands | Run) or (isinstance(path, str) and path == "random"):
         return path
@@ -44,12 +40,7 @@ def drive_input(path: Any, room: Room | None = None, *, fit: bool = False) -> Dr
 
 
 def drive_inputs(paths: Any, room: Room | None = None) -> DriveInput | list[DriveInput]:
-    """One input for all runs, or a list with one for each; a repeated name or file is read once.
-
-    Args:
-        paths: What `drive_input` takes, or an iterable of it. Points (N, 2) are one path.
-        room: As for `drive_input`.
-    """
+    """One input for all runs, or a list with one for each; a repeated name or file is read once."""
     single = isinstance(paths, str | FilePath | Path | Commands | Run)
     if single or not hasattr(paths, "__iter__"):
         return drive_input(paths, room)
@@ -62,6 +53,26 @@ def drive_inputs(paths: Any, room: Room | None = None) -> DriveInput | list[Driv
         if key not in known:
             known[key] = drive_input(path, room)
     return [known[key] for key in keys]
+
+
+def path_metadata(path: DriveInput) -> dict[str, str | int | float | bool]:
+    """File and checksum of what was driven."""
+    if isinstance(path, str):
+        return {}
+    if isinstance(path, Run):
+        arrays: Iterable[NDArray[Any]] = (array for _, array in sorted(path.items()))
+        kind, file = "replay", ""
+    elif isinstance(path, Path):
+        arrays, kind, file = (path.p_xy, np.array([path.closed])), "path", path.file
+    else:
+        arrays, kind, file = (path.rows,), "commands", path.file
+    metadata: dict[str, str | int | float | bool] = {f"{kind}_file": file} if file else {}
+    if isinstance(path, Path) and path.placing:
+        metadata["path_placing"] = " ".join(map(repr, path.placing))
+    checksum = hashlib.sha256()
+    for array in arrays:
+        checksum.update(np.ascontiguousarray(array).tobytes())
+    return {**metadata, f"{kind}_sha256": checksum.hexdigest()}
 
 
 def _are_points(values: list[Any]) -> bool:

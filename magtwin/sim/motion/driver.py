@@ -68,21 +68,7 @@ class Driver:
         speed: float = 0.2,
         duration_s: float = 60.0,
     ) -> None:
-        """Measure the room.
-
-        Args:
-            drive: Limits of the robot.
-            rng: Source of all choices.
-            floor_m: Extent of the floor in x and y, about the world's origin [m].
-            obstacles: What stands in the room.
-            footprint_radius_m: Radius of the robot [m].
-            start: Pose of the robot.
-            speed: Mean forward speed [m/s].
-            duration_s: How long to drive [s].
-
-        Raises:
-            InputError: `speed` is out of range, or there is no room at the start.
-        """
+        """Measure the room."""
         if not 0 < speed <= drive.v_max:
             raise InputError(
                 f"speed must be above 0 and at most {drive.v_max:g} m/s, the drive's v_max; got {speed!r}"

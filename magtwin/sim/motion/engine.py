@@ -2,12 +2,18 @@
 
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from magtwin.extend import Registry
-from magtwin.sim.motion.closed_loop import Chassis, ClosedLoop, run_loops
+from magtwin.run import mapped
+from magtwin.sim.motion.closed_loop import BLOCK, Chassis, ClosedLoop, motion_of, run_loops
 from magtwin.sim.motion.controllers import Controller
 from magtwin.sim.motion.drive import Motion
 from magtwin.sim.motion.sampling import Moving
 from magtwin.spec.obstacles import Obstacles
+
+Array = NDArray[np.float64]
 
 
 class Travel(Moving, Protocol):
@@ -54,14 +60,19 @@ class Kinematic:
         """As for `Engine`."""
         if controller is None:
             return run_loops([closed_loop], obstacles)[0]
-        chassis = Chassis(closed_loop, obstacles)
+        chassis, rows, records = Chassis(closed_loop, obstacles), list[Array](), list[Array]()
         for k in range(closed_loop.steps):
             t = k * closed_loop.dt
             pose = closed_loop.pose_error.perceived(t, chassis.pose, *chassis.twist)
-            chassis.step(controller.command(t, *pose, *chassis.twist))
-            if controller.done and chassis.twist == (0.0, 0.0):
+            rows.append(chassis.step(controller.command(t, *pose, *chassis.twist)))
+            last = k + 1 == closed_loop.steps or (controller.done and chassis.twist == (0.0, 0.0))
+            if last or len(rows) == BLOCK:
+                records.append(np.array(rows).T)
+                rows.clear()
+                mapped.settle(records)
+            if last:
                 break
-        return chassis.motion()
+        return motion_of(closed_loop, mapped.joined(records))
 
 
 KINEMATIC = Kinematic()

@@ -1,6 +1,7 @@
 """Follow: drive a robot along a path, or by a script of commands, 50 times a second."""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -8,13 +9,7 @@ from numpy.typing import ArrayLike
 from magtwin.errors import InputError
 from magtwin.path import Path, check_clear
 from magtwin.sim.motion.closed_loop import ClosedLoop
-from magtwin.sim.motion.controllers import (
-    CONTROLLERS,
-    CUSTOM_CONTROLLERS,
-    Controller,
-    guide_along,
-    guide_by_commands,
-)
+from magtwin.sim.motion.controllers import Controller, guide_along, guide_by_commands
 from magtwin.sim.motion.drive import Pose
 from magtwin.sim.motion.engine import KINEMATIC, Engine, Travel
 from magtwin.sim.motion.plan import SLOWEST, check_speed, drivable
@@ -24,6 +19,9 @@ from magtwin.spec.obstacles import Obstacles
 
 CONTROL_RATE_HZ = 50.0
 """Control steps a second [Hz]."""
+
+STAND = ((0.0, 0.0, 0.0),)
+"""A script that stands, for robots that something else commands."""
 
 LONGEST_M = 100_000.0
 """Longest path [m], 20 million nodes of its plan, 1.5 GB."""
@@ -38,16 +36,27 @@ def loop_along(
     *,
     speed: float,
     duration_s: float | None = None,
-    start: Pose | None = None,
-    rate_hz: float = CONTROL_RATE_HZ,
     controller: str = "follower",
     obstacles: Obstacles | None = None,
     footprint_radius_m: float = 0.0,
     wheel_errors: tuple[float, float] = (0.0, 0.0),
     pose_error: PoseError = EXACT,
 ) -> ClosedLoop:
-    """The closed loop along a path, ready to run; arguments and refusals are those of `follow`."""
-    dt = _step(rate_hz, drive)
+    """The closed loop along a path, ready to run.
+
+    Args:
+        path: Where to drive.
+        drive: Limits, motors and wheels.
+        speed: Wanted forward speed [m/s].
+        duration_s: How long to drive [s]: further laps of a closed path, back and forth on an open one.
+            Default: to the end of the path, or one lap, and stop there.
+        controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`.
+        obstacles: What the path must be clear of.
+        footprint_radius_m: Radius of the circle that they stop [m].
+        wheel_errors: Relative errors of the wheels' radius and separation.
+        pose_error: Error of the pose that the controller gets. Default: it gets the exact pose.
+    """
+    dt = 1.0 / CONTROL_RATE_HZ
     check_speed(speed, drive)
     if duration_s is not None:
         _check_duration(duration_s)
@@ -56,10 +65,6 @@ def loop_along(
     line = path if controller == "release" else drivable(path)
     if duration_s is not None:
         line = line.prolonged(speed * duration_s)
-    if start is not None:
-        line = Path(line.name, np.vstack([start[:2], line.p_xy]))
-        if obstacles is not None and math.dist(*line.p_xy[:2]) > 0:
-            check_clear(Path(f"{path.name}, from its start", line.p_xy[:2]), obstacles, footprint_radius_m)
     if duration_s is None and line.length > speed * LONGEST_S > 0:
         raise InputError(
             f"path {path.name}: its {line.length:.4g} m take {line.length / speed:.3g} s at {speed:g} m/s, "
@@ -83,7 +88,7 @@ def loop_along(
         drive=drive,
         guide=guide,
         dt=dt,
-        pose0=guide.pose0 if start is None else start,
+        pose0=guide.pose0,
         steps=max(math.ceil(duration_s / dt - 1e-9), 1),
         least_steps=int(least_s / dt),
         footprint_radius_m=footprint_radius_m,
@@ -97,60 +102,19 @@ def follow(
     drive: DriveSpec,
     *,
     speed: float,
-    duration_s: float | None = None,
-    start: Pose | None = None,
-    rate_hz: float = CONTROL_RATE_HZ,
     controller: str | Controller = "follower",
-    obstacles: Obstacles | None = None,
-    footprint_radius_m: float = 0.0,
-    wheel_errors: tuple[float, float] = (0.0, 0.0),
-    pose_error: PoseError = EXACT,
-    engine: Engine | None = None,
+    engine: Engine = KINEMATIC,
+    **options: Any,
 ) -> Travel:
-    """Drive along a path.
+    """Drive along a path, by a controller that may be an object, which gets neither path nor speed.
 
-    Args:
-        path: Where to drive.
-        drive: Limits, motors and wheels.
-        speed: Wanted forward speed [m/s].
-        duration_s: How long to drive [s]: further laps of a closed path, back and forth on an open one.
-            Default: to the end of the path, or one lap, and stop there.
-        start: First x [m], y [m], yaw [rad] in world, from where the robot drives straight to the path's
-            first point. Default: on that point, along the path.
-        rate_hz: Control steps a second [Hz].
-        controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`, a registered controller, or a
-            custom object, which gets neither path nor speed and begins at `start` or the path's start.
-        obstacles: What stops the robot.
-        footprint_radius_m: Radius of the circle that they stop [m].
-        wheel_errors: Relative errors of the wheels' radius and separation.
-        pose_error: Error of the pose that the controller gets. Default: it gets the exact pose.
-        engine: What moves the robot. Default: the kinematic engine.
-
-    Raises:
-        InputError: `speed`, `duration_s` or `rate_hz` is out of range, the path or the start touches an
-            obstacle, a command is not finite, or the end of the path was not reached in ample time.
+    Other arguments and refusals are those of `loop_along`; the end of the path must be reached in ample time.
     """
-    custom: Controller | None = None
-    if not isinstance(controller, str):
-        custom, controller = controller, "follower"
-    elif controller not in CONTROLLERS and controller in CUSTOM_CONTROLLERS:
-        custom, controller = CUSTOM_CONTROLLERS[controller](path, drive, speed), "follower"
-    closed_loop = loop_along(
-        path,
-        drive,
-        speed=speed,
-        duration_s=duration_s,
-        start=start,
-        rate_hz=rate_hz,
-        controller=controller,
-        obstacles=obstacles,
-        footprint_radius_m=footprint_radius_m,
-        wheel_errors=wheel_errors,
-        pose_error=pose_error,
-    )
-    motion = (engine or KINEMATIC).drive(closed_loop, custom, obstacles)
-    if duration_s is None:
-        check_arrived(path, speed, closed_loop, motion)
+    name, custom = (controller, None) if isinstance(controller, str) else ("follower", controller)
+    loop = loop_along(path, drive, speed=speed, controller=name, **options)
+    motion = engine.drive(loop, custom, options.get("obstacles"))
+    if options.get("duration_s") is None:
+        check_arrived(path, speed, loop, motion)
     return motion
 
 
@@ -172,43 +136,12 @@ def play(
     commands: ArrayLike,
     drive: DriveSpec,
     *,
-    start: Pose = (0.0, 0.0, 0.0),
-    duration_s: float | None = None,
-    rate_hz: float = CONTROL_RATE_HZ,
     obstacles: Obstacles | None = None,
-    footprint_radius_m: float = 0.0,
-    wheel_errors: tuple[float, float] = (0.0, 0.0),
-    controller: Controller | None = None,
-    engine: Engine | None = None,
+    engine: Engine = KINEMATIC,
+    **options: Any,
 ) -> Travel:
-    """Drive by a script. A command holds until the next one, or until it is older than the drive allows.
-
-    Args:
-        commands: Time since the start [s], forward speed [m/s] and yaw rate [rad/s] of each, shape (K, 3).
-        drive: As for `follow`.
-        start: First x [m], y [m], yaw [rad] in world.
-        duration_s: How long to drive [s]. Default: until the last command is void and the robot stands.
-        rate_hz: As for `follow`.
-        obstacles: As for `follow`.
-        footprint_radius_m: As for `follow`.
-        wheel_errors: As for `follow`.
-        controller: Commands in place of the script, such as a driver; the script then only gives the time.
-        engine: As for `follow`.
-
-    Raises:
-        InputError: Commands are not finite or not in order of time, `duration_s` or `rate_hz` is out of
-            range, or the start touches an obstacle.
-    """
-    closed_loop = loop_by_commands(
-        commands,
-        drive,
-        start=start,
-        duration_s=duration_s,
-        rate_hz=rate_hz,
-        footprint_radius_m=footprint_radius_m,
-        wheel_errors=wheel_errors,
-    )
-    return (engine or KINEMATIC).drive(closed_loop, controller, obstacles)
+    """Drive by a script; other arguments and refusals are those of `loop_by_commands`."""
+    return engine.drive(loop_by_commands(commands, drive, **options), None, obstacles)
 
 
 def loop_by_commands(
@@ -217,12 +150,22 @@ def loop_by_commands(
     *,
     start: Pose = (0.0, 0.0, 0.0),
     duration_s: float | None = None,
-    rate_hz: float = CONTROL_RATE_HZ,
     footprint_radius_m: float = 0.0,
     wheel_errors: tuple[float, float] = (0.0, 0.0),
 ) -> ClosedLoop:
-    """The closed loop that plays a script, ready to run; arguments and refusals are those of `play`."""
-    dt = _step(rate_hz, drive)
+    """The closed loop that plays a script, ready to run.
+
+    A command holds until the next one, or until it is older than the drive allows.
+
+    Args:
+        commands: Time since the start [s], forward speed [m/s] and yaw rate [rad/s] of each, shape (K, 3).
+        drive: As for `loop_along`.
+        start: First x [m], y [m], yaw [rad] in world.
+        duration_s: How long to drive [s]. Default: until the last command is void and the robot stands.
+        footprint_radius_m: As for `loop_along`.
+        wheel_errors: As for `loop_along`.
+    """
+    dt = 1.0 / CONTROL_RATE_HZ
     guide = guide_by_commands(commands, drive)
     if duration_s is None:
         at_rest = 1 + drive.v_max / drive.a_max + drive.w_max / drive.alpha_max + 20 * drive.motor_lag_s
@@ -238,19 +181,6 @@ def loop_by_commands(
         footprint_radius_m=footprint_radius_m,
         wheel_errors=wheel_errors,
     )
-
-
-def _step(rate_hz: float, drive: DriveSpec) -> float:
-    """Length of a control step [s]."""
-    if not 0 < rate_hz < math.inf:
-        raise InputError(f"rate_hz of a controller must be above 0 Hz and finite, got {rate_hz!r}")
-    if rate_hz * drive.command_timeout_s <= 1:
-        raise InputError(
-            f"rate_hz of a controller must be above {1 / drive.command_timeout_s:g} Hz, or the drive would "
-            f"stop between commands by its command_timeout_s, {drive.command_timeout_s:g} s; got "
-            f"{rate_hz!r}: raise either"
-        )
-    return 1.0 / rate_hz
 
 
 def _check_duration(duration_s: float) -> None:

@@ -1,37 +1,136 @@
 """The closed loop of a robot: controller, drive, and stops at obstacles.
 
-The same source runs as plain Python on lists, which starts at once, and compiled on arrays (`compiled.py`),
+The same source runs as plain Python on numbers, which starts at once, and compiled on arrays (`compiled.py`),
 which takes half a second to open and then 0.1 us a step. Both give the same bytes. So it uses only numbers,
 sequences of them, and operations that round alike in both: no `hypot`, no powers, no long sums.
-`closed_loop.py` prepares the input and names the output.
+`closed_loop.py` prepares the input and names the output. What does not change is in a `Drive` and in the
+`Gains` of a controller, what a step changes in a `State`: records of named numbers, which are these classes
+in plain Python and rows of structured arrays in compiled code.
 
-A step of length dt: the command is limited (`limited`). The motors follow it with a first-order lag,
-v(t) = v1 + (v0 - v1) exp(-t / lag); the step has the mean of this, so that distances and turns are exact at
-its end. The tyres slip by slip * dv/dt, as a linear tyre under the accelerating force, and by a share of the
-yaw rate. Wheels that differ from their nominal size scale the rest. The resulting twist holds for the step:
-an arc, whose chord is integrated without Euler's error. If the chord would bring the round footprint into an
-obstacle, the robot stops at it and its wheels stall. It can turn there and drive away, but does not slide
-along the obstacle, because a rubber bumper grips.
+A step of length dt:
+
+1. The controller sees the pose with its error (`perceived`) and commands a twist (`commanded`): along planned
+   nodes (`along_path`), towards points (`towards_point`), or by a script. It has passed `node` nodes, the
+   last of them `driven` metres ago.
+2. The command is limited (`limited`) to the twist `v_told`, `w_told`. The motors follow it with a first-order
+   lag, v(t) = v1 + (v0 - v1) exp(-t / lag), which leaves the wheels' twist `v`, `w` at the end of the step.
+   The step has the mean of this, `v_mean`, so that distances and turns are exact at its end.
+3. The tyres slip by slip * dv/dt, as a linear tyre under the accelerating force, and by a share of the yaw
+   rate. Wheels that differ from their nominal size scale the rest.
+4. The resulting twist holds for the step: an arc, whose chord is integrated without Euler's error. The cosine
+   and sine of the heading are carried along, and computed afresh every `ANEW` steps.
+5. If the chord would bring the round footprint into an obstacle, the robot stops at it (`bump`) and its
+   wheels stall. It can turn there and drive away, but does not slide along the obstacle, because a rubber
+   bumper grips. `free` is a distance that is surely clear; obstacles are looked at when it is used up.
 """
 
 import math
-from collections.abc import MutableSequence, Sequence
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from magtwin.sim.motion.walls import Columns, Numbers, clearance, free_way
 
-COMMANDS, RELEASE, FOLLOWER, STANLEY, PURE_PURSUIT = range(5)
+COMMANDS, RELEASE, FOLLOWER = range(3)
 """Numbers of the built-in controllers; see `controllers.py`."""
-
-FIGURES = 23 + 4 + 2 * 3 * 3
-"""Number of figures of a robot and its controller; see `drive_on`."""
 
 TABLE = 6
 """Columns of a controller's table."""
 
-STATE = 14
-"""x, y, yaw; limited command v, w; wheels' v, w; mean v of the last step; distance that is surely free; bump;
-next node; distance driven since that changed; cosine and sine of yaw."""
+
+class Limits(NamedTuple):
+    """Limits of a drive for steps of one length."""
+
+    v_max: float
+    """Speed [m/s]."""
+    w_max: float
+    """Yaw rate [rad/s]."""
+    dv: float
+    """Change of the speed in a step [m/s]."""
+    dw: float
+    """Change of the yaw rate in a step [rad/s]."""
+    rim: float
+    """Speed of a wheel's rim [m/s]."""
+    half: float
+    """Half of the distance between the wheels [m]."""
+    bend: float
+    """Curvature [1/m], which may be infinite."""
+
+
+class Drive(NamedTuple):
+    """What does not change of a robot: its `Limits`, and the rest."""
+
+    v_max: float
+    w_max: float
+    dv: float
+    dw: float
+    rim: float
+    half: float
+    bend: float
+    dt: float
+    """Length of a step [s]."""
+    left_at_end: float
+    """Share of the last speed that the motors' lag leaves at the end of a step."""
+    left_in_mean: float
+    """Its share in the mean of the step."""
+    slip: float
+    """Slip per change of speed in a step [s/m]."""
+    scale_v: float
+    scale_w: float
+    """Factors on v and w by the wheels' true size and their slip on curves."""
+    timeout: float
+    """Age at which a command is void [s]."""
+    radius: float
+    """Radius of the footprint [m]."""
+
+
+class Gains(NamedTuple):
+    """What does not change of a controller; a script has none."""
+
+    dt: float = 0.0
+    """Time between its commands [s]."""
+    delay: float = 0.0
+    """Time after which a command has its effect [s]."""
+    speed: float = 0.0
+    """Wanted speed [m/s]."""
+    creep: float = 0.0
+    """Least speed [m/s]."""
+    brake: float = 0.0
+    """Twice the planned deceleration [m/s2]."""
+    lost2: float = 0.0
+    """Square of the distance at which the robot is lost [m2]."""
+    w_path: float = 0.0
+    """Yaw rate that the path's own may reach [rad/s]."""
+    towards: float = 0.0
+    """Gain of the released follower [1/s]."""
+
+
+@dataclass(slots=True)
+class State:
+    """What a step changes; see the module."""
+
+    x: float
+    y: float
+    yaw: float
+    v_told: float = 0.0
+    w_told: float = 0.0
+    v: float = 0.0
+    w: float = 0.0
+    v_mean: float = 0.0
+    free: float = 0.0
+    bump: float = 0.0
+    node: float = 0.0
+    driven: float = 0.0
+    cos_yaw: float = 0.0
+    sin_yaw: float = 0.0
+
+
+DRIVE, GAINS, STATE = (
+    np.dtype([(name, float) for name in names]) for names in (Drive._fields, Gains._fields, State.__slots__)
+)
+"""These records as rows of arrays."""
 
 RECORD = 10
 """Columns of a step: x, y, yaw at its end; v, w of the body; v, w of the wheels at their nominal size;
@@ -81,18 +180,6 @@ ALIGN = 0.1
 ASTRAY = 0.35
 """Heading error at which driving stops until the robot has turned [rad]."""
 
-STANLEY_GAIN = 2.5
-"""Gain k of Stanley's controller [1/s], as published."""
-
-STANLEY_SOFT = 0.1
-"""Speed k_s that calms it at low speed [m/s]; assumed."""
-
-STANLEY_MOST = 1.2
-"""Largest angle of its steered wheel [rad]; assumed."""
-
-NOWHERE_M2 = 1e-12
-"""Added to the square that pure pursuit divides by, since the goal can be at the robot [m2]."""
-
 RELEASE_NEAR_M = 0.25
 """Distance from a point at which the released follower takes the next [m], as published."""
 
@@ -105,26 +192,15 @@ def wrapped(angle: float) -> float:
 
 
 def limited(
-    limits: tuple[float, float, float, float, float, float, float],
-    v_wanted: float,
-    w_wanted: float,
-    v: float,
-    w: float,
+    limits: Limits | Drive, v_wanted: float, w_wanted: float, v: float, w: float
 ) -> tuple[float, float]:
-    """The nearest twist to a wanted one within every limit of a drive.
+    """The nearest twist to a wanted one within every limit of a drive, from the last one, v and w.
 
     If a wheel would turn too fast, the forward speed is reduced, as quickly as it may change. A robot that
     steers like a car has a yaw rate of at most the highest curvature times its speed.
-
-    Args:
-        limits: Highest speed [m/s], yaw rate [rad/s], change of either in a step, speed of a wheel's rim
-            [m/s], half the distance between wheels [m], and highest curvature [1/m], which may be infinite.
-        v_wanted: Forward speed [m/s].
-        w_wanted: Yaw rate [rad/s].
-        v: Last forward speed, within the limits [m/s].
-        w: Last yaw rate, within the limits [rad/s].
     """
-    v_max, w_max, dv, dw, rim, half, bend = limits
+    v_max, w_max, dv, dw = limits.v_max, limits.w_max, limits.dv, limits.dw
+    rim, half, bend = limits.rim, limits.half, limits.bend
     slowest = abs(v) - dv
     low, high = v - dv, v + dv
     if low < -v_max:
@@ -168,9 +244,8 @@ def towards_point(
 
 
 def along_path(
-    law: int,
     table: Columns,
-    gains: tuple[float, float, float, float, float, float, float, float],
+    gains: Gains,
     node: int,
     driven: float,
     x: float,
@@ -179,27 +254,18 @@ def along_path(
     v: float,
     w: float,
 ) -> tuple[float, float, int, float]:
-    """Command of a controller along planned nodes, the next node, and the distance since it changed.
+    """Command of the follower along planned nodes, the next node, and the distance since it changed.
 
-    All share the place on the path and the planned speed there, and differ in steering. The follower's wanted
-    heading leans towards the path, by u (1 - 0.3 u^2) for a distance u L from it, which is atan(u) to a
-    milliradian unless the robot is lost; and w = v k + (4 / L) max(v, v_turn) (wanted - actual), which for
-    small errors is critically damped, with both poles at -2 / L per metre driven. Stanley's (Hoffmann et al.,
-    ACC 2007, eq. 5): a point b ahead of the axle is a steered wheel, turned by the path's heading there less
-    the robot's and by atan(-k e / (k_s + v)) for its distance e from the path; w = v tan(that) / b. Pure
-    pursuit (Coulter, CMU-RI-TR-92-01): the arc through a goal on the path some way ahead, w = v 2 y / D^2 for
-    a goal at distance D that is y to the left.
-
-    Each stops and turns on the spot if its heading is far off, as in corners. A robot that was carried away
-    drives straight back to where it left the path.
+    Its wanted heading leans towards the path, by u (1 - 0.3 u^2) for a distance u L from it, which is atan(u)
+    to a milliradian unless the robot is lost; and w = v k + (4 / L) max(v, v_turn) (wanted - actual), which
+    for small errors is critically damped, with both poles at -2 / L per metre driven. It stops and turns on
+    the spot if its heading is far off, as in corners. A robot that was carried away drives straight back to
+    where it left the path.
 
     Args:
-        law: FOLLOWER, STANLEY or PURE_PURSUIT.
         table: x, y [m], heading [rad], curvature [1/m], squared planned speed [m2/s2], and way left in its
             piece [m] of each node, which is 0 at the last node of a piece.
-        gains: dt [s]; time after which a command has its effect [s]; wanted and least speed [m/s]; twice
-            the planned deceleration [m/s2]; square of the distance at which the robot is lost [m2]; yaw
-            rate that the path's own may reach [rad/s]; distance that Stanley or pure pursuit looks ahead [m].
+        gains: The follower's.
         node: Node that begins the segment that the robot was abreast of.
         driven: Way since then [m].
         x: Position in world [m].
@@ -209,12 +275,12 @@ def along_path(
         w: Yaw rate [rad/s].
     """
     xs, ys, headings, curvatures, squares, lefts = table
-    dt, delay, speed, creep, brake, lost2, w_path, look = gains
+    dt, delay, speed = gains.dt, gains.delay, gains.speed
     i = node
     ex, ey = x - xs[i], y - ys[i]
     away2 = ex * ex + ey * ey
-    if away2 > lost2:
-        planned = math.sqrt(brake * math.sqrt(away2))
+    if away2 > gains.lost2:
+        planned = math.sqrt(gains.brake * math.sqrt(away2))
         if planned > speed:
             planned = speed
         error = wrapped(math.atan2(-ey, -ex) - yaw)
@@ -253,68 +319,37 @@ def along_path(
     if j > last:
         j, part = last, 1.0
     planned = math.sqrt(squares[j] + part * (squares[j + 1] - squares[j]))
-    if planned < creep:
-        planned = creep
+    if planned < gains.creep:
+        planned = gains.creep
     if planned * dt > left:
         planned = left / dt
-    if law == FOLLOWER:
-        bend = v * (curvatures[j] + part * (curvatures[j + 1] - curvatures[j]))
-        if bend > w_path:
-            bend = w_path
-        elif bend < -w_path:
-            bend = -w_path
-        lean = (dx * ey - dy * ex) / (math.sqrt(length2) * SETTLE_M)
-        lean *= 1.0 - 0.3 * lean * lean
-        wanted = headings[j] + part * (headings[j + 1] - headings[j]) - lean
-        error = wrapped(wanted - (yaw + w * delay))
-        off = abs(error)
-        if off > ALIGN:
-            planned *= (ASTRAY - off) / (ASTRAY - ALIGN) if off < ASTRAY else 0.0
-        return planned, bend + GAIN * (v if v > V_TURN else V_TURN) * error, i, driven
-    ahead = along + look * per_m
-    j = int(ahead)
-    part = ahead - j
-    j += i
-    beyond = 0.0  # past its end a piece goes on straight
-    if j > last:
-        beyond = (ahead - (last + 1 - i)) * spacing
-        j, part = last, 1.0
-    heading = headings[j] + part * (headings[j + 1] - headings[j])
-    gx = xs[j] + part * (xs[j + 1] - xs[j]) + beyond * math.cos(heading) - x
-    gy = ys[j] + part * (ys[j + 1] - ys[j]) + beyond * math.sin(heading) - y
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    if law == STANLEY:
-        error = wrapped(heading - yaw)
-        fx, fy = gx - look * cos, gy - look * sin  # from the steered wheel to the path beside it
-        beside = math.cos(heading) * fy - math.sin(heading) * fx
-        steer = error + math.atan(STANLEY_GAIN * beside / (STANLEY_SOFT + (v if v > 0.0 else 0.0)))
-        if steer > STANLEY_MOST:
-            steer = STANLEY_MOST
-        elif steer < -STANLEY_MOST:
-            steer = -STANLEY_MOST
-        bent = math.tan(steer) / look
-    else:
-        error = wrapped(math.atan2(gy, gx) - yaw)
-        bent = 2.0 * (cos * gy - sin * gx) / (gx * gx + gy * gy + NOWHERE_M2)
+    bend = v * (curvatures[j] + part * (curvatures[j + 1] - curvatures[j]))
+    if bend > gains.w_path:
+        bend = gains.w_path
+    elif bend < -gains.w_path:
+        bend = -gains.w_path
+    lean = (dx * ey - dy * ex) / (math.sqrt(length2) * SETTLE_M)
+    lean *= 1.0 - 0.3 * lean * lean
+    wanted = headings[j] + part * (headings[j + 1] - headings[j]) - lean
+    error = wrapped(wanted - (yaw + w * delay))
     off = abs(error)
-    if off > ASTRAY or (off > ALIGN and v <= 2.0 * creep):
-        return 0.0, TURN_GAIN * error, i, driven
-    return planned, v * bent, i, driven
+    if off > ALIGN:
+        planned *= (ASTRAY - off) / (ASTRAY - ALIGN) if off < ASTRAY else 0.0
+    return planned, bend + GAIN * (v if v > V_TURN else V_TURN) * error, i, driven
 
 
 def perceived(
-    errors: Numbers, first: int, t: float, x: float, y: float, yaw: float, v: float, w: float
+    errors: Numbers, t: float, x: float, y: float, yaw: float, v: float, w: float
 ) -> tuple[float, float, float]:
     """The pose that a path follower gets: late, and with the slow errors of a localization.
 
     It is the pose of `latency` ago if v and w were constant, plus a e(t) for each of x, y and yaw with
     e(t) = sqrt(2 / M) sum_m cos(W_m t + F_m), the spectral representation of a stationary process
-    (Shinozuka and Deodatis 1991). `closed_loop.PoseError` draws W and F.
+    (Shinozuka and Deodatis 1991). `pose_error.py` draws W and F.
 
     Args:
-        errors: From `first` on: latency [s]; a of x [m], y [m] and yaw [rad], each times sqrt(2 / M); then
-            W [rad/s] and F [rad] of the M waves of x, of y, and of yaw.
-        first: Where they begin.
+        errors: Latency [s]; a of x [m], y [m] and yaw [rad], each times sqrt(2 / M); then W [rad/s] and
+            F [rad] of the M waves of x, of y, and of yaw.
         t: Time since the start [s].
         x: Position in world [m].
         y: Position in world [m].
@@ -322,31 +357,31 @@ def perceived(
         v: Forward speed [m/s].
         w: Yaw rate [rad/s].
     """
-    late = errors[first]
-    at = first + 4
+    late = errors[0]
+    at = 4
     x -= late * v * math.cos(yaw - 0.5 * late * w)
     y -= late * v * math.sin(yaw - 0.5 * late * w)
     yaw -= late * w
     wave = 0.0
     for m in range(WAVES):
         wave += math.cos(errors[at + 2 * m] * t + errors[at + 2 * m + 1])
-    x += errors[first + 1] * wave
+    x += errors[1] * wave
     at += 2 * WAVES
     wave = 0.0
     for m in range(WAVES):
         wave += math.cos(errors[at + 2 * m] * t + errors[at + 2 * m + 1])
-    y += errors[first + 2] * wave
+    y += errors[2] * wave
     at += 2 * WAVES
     wave = 0.0
     for m in range(WAVES):
         wave += math.cos(errors[at + 2 * m] * t + errors[at + 2 * m + 1])
-    return x, y, yaw + errors[first + 3] * wave
+    return x, y, yaw + errors[3] * wave
 
 
 def commanded(
     law: int,
     table: Columns,
-    gains: tuple[float, float, float, float, float, float, float, float],
+    gains: Gains,
     timeout: float,
     node: int,
     driven: float,
@@ -360,17 +395,16 @@ def commanded(
     """Command of any controller at a time t [s], the next node, and the distance since it changed.
 
     A controller is done when the next node is the number of its nodes; it then commands a stop. A scripted
-    command holds until it is older than `timeout` [s]. Other arguments as for `along_path`; the released
-    follower has its gain in the place of the distance to look ahead.
+    command holds until it is older than `timeout` [s]. Other arguments as for `along_path`.
     """
     times = table[0]
     count = len(times)
     if node >= count:
         return 0.0, 0.0, node, driven
-    if law >= FOLLOWER:
-        return along_path(law, table, gains, node, driven, x, y, yaw, v, w)
+    if law == FOLLOWER:
+        return along_path(table, gains, node, driven, x, y, yaw, v, w)
     if law == RELEASE:
-        v_cmd, w_cmd, node = towards_point(times, table[1], gains[2], gains[7], node, x, y, yaw)
+        v_cmd, w_cmd, node = towards_point(times, table[1], gains.speed, gains.towards, node, x, y, yaw)
         return v_cmd, w_cmd, node, driven
     t += LATE_S
     while node + 1 < count and times[node + 1] <= t:
@@ -383,13 +417,29 @@ def commanded(
     return table[1][node], table[2][node], node, driven
 
 
+def way_open(
+    fence: Columns, spans: Sequence[int], radius: float, x: float, y: float, ux: float, uy: float, way: float
+) -> tuple[float, float]:
+    """Share of a way that a footprint can go, and the distance that is surely free after it [m].
+
+    Arguments as for `free_way`.
+    """
+    free = clearance(fence, spans, x, y, radius + 1.0 + way) - radius - way
+    if free >= 0.0:
+        return 1.0, free
+    until = free_way(fence, spans, radius, x, y, ux, uy, way)
+    return (until / way if until < way else 1.0), 0.0
+
+
 def drive_on(
     law: int,
-    figures: Numbers,
+    drive: Drive,
+    gains: Gains,
+    errors: Numbers,
     table: Columns,
     fence: Columns,
     spans: Sequence[int],
-    state: MutableSequence[float],
+    state: State,
     first: int,
     steps: int,
     record: Sequence[Any],
@@ -398,15 +448,14 @@ def drive_on(
 
     Args:
         law: Number of its controller.
-        figures: dt [s]; the seven limits of `limited`; share of the last speed that is left at the end of a
-            step, and its share in the mean of the step; slip per change of speed in a step [s/m]; scales of v
-            and w; age at which a command is void [s]; radius of the footprint [m]; the eight
-            `gains` of `along_path`; the errors of `perceived`, which scripts ignore.
+        drive: The robot.
+        gains: Those of its controller.
+        errors: As for `perceived`; scripts ignore them.
         table: For COMMANDS time [s], v [m/s], w [rad/s] of each; for RELEASE x, y of each point [m]; for
-            the others as in `along_path`. Other columns are not read.
+            FOLLOWER as in `along_path`. Other columns are not read.
         fence: As for `clearance`.
         spans: As for `clearance`.
-        state: STATE numbers, which are changed.
+        state: Where it is, which is changed.
         first: Number of the first step since the start.
         steps: Most steps.
         record: RECORD columns of at least `steps` numbers each, which are filled.
@@ -414,29 +463,16 @@ def drive_on(
     Returns:
         How many steps were made.
     """
-    dt = figures[0]
-    limits = (figures[1], figures[2], figures[3], figures[4], figures[5], figures[6], figures[7])
-    left_at_end, left_in_mean, slip = figures[8], figures[9], figures[10]
-    scale_v, scale_w = figures[11], figures[12]
-    timeout, radius, rest_w = figures[13], figures[14], REST_M_S / figures[6]
-    gains = (
-        figures[15],
-        figures[16],
-        figures[17],
-        figures[18],
-        figures[19],
-        figures[20],
-        figures[21],
-        figures[22],
-    )
+    dt, left_at_end, left_in_mean = drive.dt, drive.left_at_end, drive.left_in_mean
+    slip, scale_v, scale_w = drive.slip, drive.scale_v, drive.scale_w
+    rest_w = REST_M_S / drive.half
     blurred = law != COMMANDS and (
-        figures[23] != 0.0 or figures[24] != 0.0 or figures[25] != 0.0 or figures[26] != 0.0
+        errors[0] != 0.0 or errors[1] != 0.0 or errors[2] != 0.0 or errors[3] != 0.0
     )
     count = len(table[0])
-    x, y, yaw = state[0], state[1], state[2]
-    v_told, w_told, v, w, v_mean, free = state[3], state[4], state[5], state[6], state[7], state[8]
-    bump, node, driven = state[9], int(state[10]), state[11]
-    cos_yaw, sin_yaw = state[12], state[13]
+    x, y, yaw, cos_yaw, sin_yaw = state.x, state.y, state.yaw, state.cos_yaw, state.sin_yaw
+    v_told, w_told, v, w, v_mean = state.v_told, state.w_told, state.v, state.w, state.v_mean
+    free, bump, node, driven = state.free, state.bump, int(state.node), state.driven
     to_x, to_y, to_yaw, to_v, to_w, to_wheel_v, to_wheel_w, to_v_cmd, to_w_cmd, to_bump = record
     half_dt = dt / 2
     made = steps
@@ -444,11 +480,11 @@ def drive_on(
         t = (first + k) * dt
         px, py, pyaw = x, y, yaw
         if blurred:
-            px, py, pyaw = perceived(figures, 23, t, x, y, yaw, v, w)
+            px, py, pyaw = perceived(errors, t, x, y, yaw, v, w)
         v_cmd, w_cmd, node, driven = commanded(
-            law, table, gains, timeout, node, driven, t, px, py, pyaw, v, w
+            law, table, gains, drive.timeout, node, driven, t, px, py, pyaw, v, w
         )
-        v_told, w_told = limited(limits, v_cmd, w_cmd, v_told, w_told)
+        v_told, w_told = limited(drive, v_cmd, w_cmd, v_told, w_told)
         was = v_mean
         v_mean = v_told + left_in_mean * (v - v_told)
         w_mean = w_told + left_in_mean * (w - w_told)
@@ -477,20 +513,15 @@ def drive_on(
         cos_yaw, sin_yaw = cos * cos_half - sin * sin_half, sin * cos_half + cos * sin_half
         free -= abs(chord)
         if free < 0.0:
-            way = abs(chord)
-            free = clearance(fence, spans, x, y, radius + 1.0 + way) - radius - way
+            sign = 1.0 if chord > 0.0 else -1.0
+            part, free = way_open(fence, spans, drive.radius, x, y, sign * cos, sign * sin, abs(chord))
             bump = 0.0
-            if free < 0.0:
-                sign = 1.0 if chord > 0.0 else -1.0
-                until = free_way(fence, spans, radius, x, y, sign * cos, sign * sin, way)
-                free = 0.0
-                if until < way:
-                    part = until / way
-                    chord *= part
-                    v_body *= part
-                    v_mean *= part
-                    v = v_told = 0.0
-                    bump = 1.0
+            if part < 1.0:
+                chord *= part
+                v_body *= part
+                v_mean *= part
+                v = v_told = 0.0
+                bump = 1.0
         x += chord * cos
         y += chord * sin
         yaw += half + half
@@ -502,15 +533,17 @@ def drive_on(
         if node >= count and v == 0.0 and w == 0.0:
             made = k + 1
             break
-    state[0], state[1], state[2] = x, y, yaw
-    state[3], state[4], state[5], state[6], state[7], state[8] = v_told, w_told, v, w, v_mean, free
-    state[9], state[10], state[11], state[12], state[13] = bump, float(node), driven, cos_yaw, sin_yaw
+    state.x, state.y, state.yaw, state.cos_yaw, state.sin_yaw = x, y, yaw, cos_yaw, sin_yaw
+    state.v_told, state.w_told, state.v, state.w, state.v_mean = v_told, w_told, v, w, v_mean
+    state.free, state.bump, state.node, state.driven = free, bump, float(node), driven
     return made
 
 
 def robots(
     laws: Any,
-    figures: Any,
+    drives: Any,
+    gains: Any,
+    errors: Any,
     tables: Any,
     begin: Any,
     end: Any,
@@ -527,14 +560,16 @@ def robots(
 
     Args:
         laws: Numbers of the controllers, shape (N,).
-        figures: Figures of each robot, shape (N, FIGURES).
+        drives: Fields of `Drive` of each robot, shape (N,).
+        gains: Fields of `Gains` of each controller, shape (N,).
+        errors: Errors of each pose, shape (N, 4 + 6 WAVES).
         tables: All tables, one after the other, shape (TABLE, M).
         begin: Start of each robot's table, shape (N,).
         end: End of each robot's table, shape (N,).
         fence: x0, y0, x1, y1 of the obstacles' edges, shape (4, E).
         boxes: Lower and upper corners about each obstacle, shape (4, O).
         spans: Edge that begins each obstacle, and E, shape (O + 1,).
-        state: State of each robot, which is changed, shape (N, STATE).
+        state: Fields of `State` of each robot, which are changed, shape (N,).
         first: Number of the first step since the start.
         steps: Most steps.
         record: Takes what happened, shape (N, RECORD, steps).
@@ -543,24 +578,10 @@ def robots(
     walls = (fence[0], fence[1], fence[2], fence[3], boxes[0], boxes[1], boxes[2], boxes[3])
     for n in range(len(laws)):
         a, b = begin[n], end[n]
-        table = (
-            tables[0, a:b],
-            tables[1, a:b],
-            tables[2, a:b],
-            tables[3, a:b],
-            tables[4, a:b],
-            tables[5, a:b],
+        columns = tables[:, a:b]
+        table = (columns[0], columns[1], columns[2], columns[3], columns[4], columns[5])
+        r = record[n]
+        to = (r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9])
+        made[n] = drive_on(
+            laws[n], drives[n], gains[n], errors[n], table, walls, spans, state[n], first, steps, to
         )
-        to = (
-            record[n, 0],
-            record[n, 1],
-            record[n, 2],
-            record[n, 3],
-            record[n, 4],
-            record[n, 5],
-            record[n, 6],
-            record[n, 7],
-            record[n, 8],
-            record[n, 9],
-        )
-        made[n] = drive_on(laws[n], figures[n], table, walls, spans, state[n], first, steps, to)

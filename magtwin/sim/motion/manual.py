@@ -2,15 +2,12 @@
 
 import struct
 from collections.abc import Iterator, Sequence
-from typing import Protocol
 
 import numpy as np
 
-from magtwin.sim.motion.closed_loop import Chassis, ClosedLoop
+from magtwin.sim.motion.closed_loop import Chassis
 from magtwin.sim.motion.commands import Commands
-from magtwin.sim.motion.controllers import guide_by_commands
 from magtwin.spec.drive import DriveSpec
-from magtwin.spec.obstacles import Obstacles
 
 V_STEP, W_STEP = 0.05, 0.25
 """Change of speed [m/s] and yaw rate [rad/s] by one key press."""
@@ -29,28 +26,24 @@ KEYS = {
 HELP = "w/s or up/down: speed, a/d or left/right: turn, x: straight on, space: stop, q: end"
 
 
-class Hand(Protocol):
+class Hand:
     """An input device; its input so far gives the present command."""
-
-    command: tuple[float, float]
-    """Forward speed [m/s] and yaw rate [rad/s]."""
-
-    done: bool
-    """Whether the drive is to end."""
-
-    def feed(self, data: bytes) -> None:
-        """Take bytes from the device; no bytes mean its end."""
-
-
-class Keyboard:
-    """The keys of a terminal. Key releases are unknown, so each press changes the speeds by a step."""
 
     def __init__(self, drive: DriveSpec) -> None:
         """Stand still."""
-        self._drive = drive
-        self._rest = b""
+        self._drive, self._rest = drive, b""
         self.command = 0.0, 0.0
+        """Forward speed [m/s] and yaw rate [rad/s]."""
         self.done = False
+        """Whether the drive is to end."""
+
+    def feed(self, data: bytes) -> None:
+        """Take bytes from the device; no bytes mean its end."""
+        raise NotImplementedError
+
+
+class Keyboard(Hand):
+    """The keys of a terminal. Key releases are unknown, so each press changes the speeds by a step."""
 
     def feed(self, data: bytes) -> None:
         """As for `Hand`; other keys are ignored."""
@@ -85,7 +78,7 @@ class Keyboard:
         self.command = v, min(max(round(w, 9), -drive.w_max), drive.w_max)
 
 
-class Gamepad:
+class Gamepad(Hand):
     """A gamepad of Linux (/dev/input/js0): left stick drives, Start ends.
 
     Its events are 8 bytes: time [ms], value, type (1 button, 2 axis; plus 128 for the initial state), and
@@ -97,13 +90,6 @@ class Gamepad:
 
     END = (7, 9)
     """Numbers of the Start button on pads of two makers."""
-
-    def __init__(self, drive: DriveSpec) -> None:
-        """Stand still."""
-        self._drive = drive
-        self._rest = b""
-        self.command = 0.0, 0.0
-        self.done = False
 
     def feed(self, data: bytes) -> None:
         """As for `Hand`."""
@@ -141,28 +127,3 @@ class Recorder:
         """All commands, one row per control step, and a stop at the end."""
         rows: Sequence[tuple[float, float, float]] = [*self._rows, (len(self._rows) * self._dt, 0.0, 0.0)]
         return Commands(name, np.array(rows))
-
-
-def at_start(
-    drive: DriveSpec,
-    start: tuple[float, float, float],
-    obstacles: Obstacles,
-    footprint_radius_m: float,
-    wheel_errors: tuple[float, float],
-    dt: float,
-) -> Chassis:
-    """A robot to be driven by hand, at rest at `start`.
-
-    Raises:
-        InputError: It would begin in an obstacle.
-    """
-    course = ClosedLoop(
-        drive=drive,
-        guide=guide_by_commands([[0.0, 0.0, 0.0]], drive),
-        dt=dt,
-        pose0=start,
-        steps=1,
-        footprint_radius_m=footprint_radius_m,
-        wheel_errors=wheel_errors,
-    )
-    return Chassis(course, obstacles)

@@ -95,15 +95,6 @@ def plan(path: Path, drive: DriveSpec, *, speed: float) -> list[Piece]:
     A planned speed is at most `speed` and keeps w = k v, dw/dt = (dk/ds) v^2 and the rate of the outer wheel,
     v (1 + |k| b / 2) / r, within the drive's limits. Each piece begins and ends with a stop, within the limit
     of acceleration.
-
-    Args:
-        path: Where to drive, as an open line.
-        drive: Limits.
-        speed: Wanted forward speed [m/s].
-
-    Raises:
-        InputError: `speed` is not above 0 or is more than the drive allows, or the path turns more tightly
-            than a robot that steers like a car can.
     """
     check_speed(speed, drive)
     if drive.turning_radius_m:
@@ -191,9 +182,6 @@ def drivable(path: Path) -> Path:
 
     Its first and last points stay. A robot that was recorded at rest leaves a knot of points that no robot
     can follow.
-
-    Raises:
-        InputError: The whole path lies within 5 mm.
     """
     if np.diff(path.s).min() >= _JITTER_M:
         return path

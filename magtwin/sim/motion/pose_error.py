@@ -30,7 +30,7 @@ class PoseError:
             v: Forward speed [m/s].
             w: Yaw rate [rad/s].
         """
-        return loop.perceived(self.figures, 0, t, *pose, v, w)
+        return loop.perceived(self.figures, t, *pose, v, w)
 
     def reach_m(self, v_max: float) -> float:
         """Distance by which the pose that a controller gets may well be off at a speed [m]."""

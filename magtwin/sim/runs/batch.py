@@ -10,27 +10,21 @@ import importlib
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, overload
 
 import numpy as np
 
 from magtwin.errors import InputError, find
-from magtwin.path import Path
 from magtwin.report.summary import Summarized, Summary, listed
 from magtwin.run.run import COLUMNS, Run
-from magtwin.sim.motion.closed_loop import LOOPS, ClosedLoop, run_loops, warm_up
-from magtwin.sim.motion.commands import Commands
-from magtwin.sim.motion.controllers import CONTROLLERS, CUSTOM_CONTROLLERS
-from magtwin.sim.motion.drive import Pose, draw_wheel_errors
-from magtwin.sim.motion.drive_input import DriveInput
+from magtwin.sim.motion.closed_loop import LOOPS, warm_up
+from magtwin.sim.motion.drive_input import DriveInput, path_metadata
 from magtwin.sim.motion.engine import Travel
-from magtwin.sim.motion.follow import check_arrived, loop_along, loop_by_commands
-from magtwin.sim.motion.pose_error import draw_pose_error
+from magtwin.sim.runs.driving import Course, Metadata, Trip, course_of, drive, labelled
 from magtwin.sim.runs.sensing import Conditions, Sensing, streams
-from magtwin.sim.runs.simulate import Metadata, Sensed, check_run, read_all, readings, sense_all, travel
-from magtwin.spec.drive import DriveSpec
+from magtwin.sim.runs.simulate import Sensed, check_run, read_all, readings, sense_all
 from magtwin.spec.scene import Scene
 
 BLOCK = 16
@@ -94,19 +88,7 @@ class Runs(Summarized, Sequence[Run]):
         columns: Iterable[str] | None = None,
         block: int = BLOCK,
     ) -> None:
-        """Check every job; nothing is driven yet.
-
-        Args:
-            jobs: The runs, at least one.
-            conditions: What they have in common; the engine is the kinematic one.
-            finish: Makes whole runs of sensed ones.
-            columns: Columns to keep beside t. Default: all.
-            block: Runs made at a time.
-
-        Raises:
-            InputError: There is no job, a column or `block` is wrong, or `simulate` would refuse a job; the
-                text then has its number.
-        """
+        """Check every job; nothing is driven yet."""
         if not jobs:
             raise InputError("no runs are asked for; give a seed for each")
         if not isinstance(block, int) or block < 1:
@@ -115,16 +97,16 @@ class Runs(Summarized, Sequence[Run]):
         self._columns = frozenset(COLUMNS if columns is None else {"t", *columns})
         for name in sorted(self._columns):
             find("column", name, COLUMNS)
-        self._planned: dict[tuple[Path | Commands, float, DriveSpec, float, Pose], ClosedLoop] = {}
+        self._planned: dict[Any, Course] = {}
         self._kept, self._steps = 0, 0  # bytes of plans, and expected steps
         checked = set()
         for i, job in enumerate(jobs):
-            with self._numbered(i):
+            with labelled(self._label(i)):
                 key = (id(job.scene), id(job.path))
                 if key not in checked:
                     check_run(job.scene, job.path, conditions)
                     checked.add(key)
-                if planned := self._closed_loop(job):
+                if planned := self._course(job).loop:
                     self._steps += planned.least_steps
         self._open_loops()
 
@@ -216,50 +198,28 @@ class Runs(Summarized, Sequence[Run]):
     def _sensed(self, numbers: Sequence[int]) -> list[Any]:
         """Drive some runs, and sense those that are not long."""
         common = self._conditions
-        draws = {i: streams(np.random.default_rng(self._jobs[i].seed)) for i in numbers}
-        loops: dict[int, ClosedLoop] = {}
-        for i in numbers:
-            if (planned := self._closed_loop(self._jobs[i])) is not None:
-                drive = self._jobs[i].scene.robot.drive
-                errors = draw_wheel_errors(drive, draws[i]["drive"])
-                pose_error = draw_pose_error(drive, draws[i]["drive"])
-                loops[i] = replace(planned, drive=drive, wheel_errors=errors, pose_error=pose_error)
-        motions = dict(zip(loops, run_loops(list(loops.values()), common.obstacles), strict=True))
+        jobs = [self._jobs[i] for i in numbers]
+        trips = [
+            Trip(job.scene, self._course(job), streams(np.random.default_rng(job.seed)), self._label(i))
+            for i, job in zip(numbers, jobs, strict=True)
+        ]
+        motions = drive(trips, common)
         sensed: list[Sensed | _Driven] = []
-        for i in numbers:
-            job = self._jobs[i]
-            with self._numbered(i):
-                motion: Travel
-                if i in motions:
-                    motion, metadata = motions.pop(i), self._metadata(job)
-                    if isinstance(job.path, Path) and common.duration_s is None:
-                        check_arrived(job.path, job.speed, loops[i], motion)
-                else:
-                    motion, metadata = travel(job.scene, job.path, draws[i], job.speed, common)
-                sensing = Sensing(job.scene, draws[i], common, wanted=self._columns)
+        for trip in trips:
+            with labelled(trip.label):
+                motion, metadata = motions.pop(0), trip.course.metadata
+                sensing = Sensing(trip.scene, trip.draws, common, wanted=self._columns)
                 count, _ = readings(sensing, motion, metadata)
                 long = sensing.rows_at_once(count) < count
                 make = _Driven if long else sense_all
                 sensed.append(make(sensing, motion, metadata))
         return sensed
 
-    def _metadata(self, job: Job) -> Metadata:
-        """As `travel` gives it for a closed loop that was planned."""
-        if isinstance(job.path, Commands):
-            return {"path": job.path.name, "controller": "commands"}
-        assert isinstance(job.path, Path)
-        name = str(self._conditions.controller)
-        return {"path": job.path.name, "controller": name, "speed_m_s": float(job.speed)}
-
-    def _closed_loop(self, job: Job) -> ClosedLoop | None:
-        """The closed loop of a job without its wheels' errors, planned once for jobs that share it.
-
-        Plans beyond `PLANNED` bytes are made again when they are needed. None if it cannot be planned: a
-        random driver, a custom controller, or a run that is driven again.
-        """
-        common, radius = self._conditions, job.scene.robot.footprint_radius_m
+    def _course(self, job: Job) -> Course:
+        """What a job drives, planned once for jobs that share it, and again beyond `PLANNED` bytes."""
+        robot = job.scene.robot
         alike = replace(
-            job.scene.robot.drive,
+            robot.drive,
             wheel_errors=(0.0, 0.0),
             wheel_radius_error_std=0.0,
             wheel_separation_error_std=0.0,
@@ -267,54 +227,21 @@ class Runs(Summarized, Sequence[Run]):
             odometry_noise_std=0.0,
         )
         if isinstance(job.path, Run):
-            return None
-        if isinstance(job.path, str):
-            stand = [[0.0, 0.0, 0.0]]
-            loop_by_commands(stand, alike, start=job.scene.start, footprint_radius_m=radius).check(
-                common.obstacles
-            )
-            return None
-        key = (job.path, job.speed, alike, radius, job.scene.start)
+            return course_of(job.scene, job.path, job.speed, self._conditions)
+        key = (job.path, job.speed, alike, robot.footprint_radius_m, job.scene.start)
         if key in self._planned:
             return self._planned[key]
         if self._kept > PLANNED:
             self._planned.clear()
             self._kept = 0
-        if isinstance(job.path, Path):
-            if not isinstance(common.controller, str) or (
-                common.controller not in CONTROLLERS and common.controller in CUSTOM_CONTROLLERS
-            ):
-                return None
-            planned = loop_along(
-                job.path,
-                alike,
-                speed=job.speed,
-                duration_s=common.duration_s,
-                controller=common.controller,
-                obstacles=common.obstacles,
-                footprint_radius_m=radius,
-            )
-        else:
-            planned = loop_by_commands(
-                job.path.rows,
-                alike,
-                start=job.scene.start,
-                duration_s=common.duration_s,
-                footprint_radius_m=radius,
-            )
-            planned.check(common.obstacles)
-        self._kept += planned.guide.table.nbytes
-        self._planned[key] = planned
-        return planned
+        course = course_of(job.scene, job.path, job.speed, self._conditions)
+        self._kept += course.loop.guide.table.nbytes if course.loop else 0
+        self._planned[key] = course
+        return course
 
-    @contextmanager
-    def _numbered(self, index: int) -> Iterator[None]:
-        """Put the number of the run into refusals."""
-        try:
-            yield
-        except InputError as error:
-            text = f"run {index} of {len(self)}, counted from 0: {error}"
-            raise InputError(text, parameter=error.parameter) from error
+    def _label(self, index: int) -> str:
+        """The number of a run, for refusals."""
+        return f"run {index} of {len(self)}, counted from 0"
 
     def _summary(self) -> Summary:
         names = dict.fromkeys(
@@ -333,14 +260,5 @@ class Runs(Summarized, Sequence[Run]):
 
 def _content(path: DriveInput) -> str:
     """What is driven, as a text: a name, or a name with a checksum of the points, commands or columns."""
-    if isinstance(path, str):
-        return path
-    arrays = (
-        path.columns.values()
-        if isinstance(path, Run)
-        else (path.p_xy if isinstance(path, Path) else path.rows,)
-    )
-    total = hashlib.sha256()
-    for array in arrays:
-        total.update(np.ascontiguousarray(array).tobytes())
-    return f"{getattr(path, 'name', 'run')} {total.hexdigest()}"
+    sums = [value for name, value in path_metadata(path).items() if name.endswith("_sha256")]
+    return " ".join([path if isinstance(path, str) else getattr(path, "name", "run"), *map(str, sums)])

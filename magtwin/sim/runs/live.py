@@ -4,8 +4,9 @@ If `simulate` drives the same commands from the same seed, it gives the same col
 """
 
 from array import array
-from collections.abc import Callable, Iterable
-from typing import Any, Literal
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,24 +16,16 @@ from magtwin.run.run import Run
 from magtwin.sim.motion.closed_loop import Chassis
 from magtwin.sim.motion.commands import Commands
 from magtwin.sim.motion.drive import Moment, draw_wheel_errors, moment_in_steps, wheel_rates
-from magtwin.sim.motion.follow import CONTROL_RATE_HZ
-from magtwin.sim.motion.manual import at_start
+from magtwin.sim.runs.driving import course_of
 from magtwin.sim.runs.neighbours import Neighbour
-from magtwin.sim.runs.sensing import Conditions, LidarMode, Sensing, streams
-from magtwin.sim.runs.simulate import check_run, run_metadata
+from magtwin.sim.runs.sensing import Conditions, Sensing, streams
+from magtwin.sim.runs.simulate import Finish, Sensed, check_run, run_metadata
 from magtwin.sim.sensors.clock import Samples
 from magtwin.sim.sensors.lidar import Scanner, Scans
-from magtwin.sim.sensors.model_error import ModelError
 from magtwin.spec.drive import DriveSpec
-from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import Scene
 
 Array = NDArray[np.float64]
-Network = Callable[[Run], tuple[NDArray[Any], NDArray[Any], "NDArray[np.bool_] | None", NDArray[Any]]]
-"""From rows of a run to the disturbance of each, the standard deviation of its error [nT] that model errors
-are drawn with, whether it is outside of the training range, and the standard deviation for `b_sd_nt` [nT].
-Rows come in the order of time, each once."""
-
 KEPT = 256
 """Control steps that are kept: 5 s, more than any sensor needs."""
 
@@ -90,50 +83,25 @@ class LiveRobot:
         *,
         anomaly_map: AnomalyMap,
         rng: np.random.Generator,
-        obstacles: Obstacles | None = None,
-        rate_hz: float | None = None,
-        network: Network | None = None,
-        model_error: ModelError | None = None,
-        outside: Literal["nan", "clamp"] = "nan",
-        lidar: LidarMode = "schedule",
+        network: bool = False,
+        finish: Finish = Sensed.read,
+        **options: Any,
     ) -> None:
-        """Put it at the scene's start, at rest.
-
-        Args:
-            scene: As for `magtwin.sim.runs.simulate.simulate`, like all that follows.
-            anomaly_map: The map of `scene.map_layer`.
-            rng: Source of all noise.
-            obstacles: What stops the robot, and what its LiDAR sees.
-            rate_hz: Magnetometer readings a second [Hz]. Default: the scene's.
-            network: Predicts the disturbance of a neural magnetometer.
-            model_error: Statistics of the error of these predictions; None draws no error.
-            outside: What the map reads outside its extent.
-            lidar: Whether the LiDAR follows its schedule, or stays on or off.
-
-        Raises:
-            InputError: It would begin in an obstacle, or an option is out of range.
-        """
-        robot, obstacles = scene.robot, obstacles or Obstacles()
-        conditions = Conditions(
-            anomaly_map=anomaly_map,
-            network=network is not None,
-            rate_hz=rate_hz,
-            lidar=lidar,
-            outside=outside,
-        )
-        check_run(scene, Commands("live", np.zeros((1, 3))), conditions)
-        self.step_s = 1.0 / CONTROL_RATE_HZ
-        draws = streams(rng)
+        """Put it at the scene's start, at rest; arguments as for `magtwin.sim.runs.simulate.simulate`."""
+        conditions = Conditions(anomaly_map=anomaly_map, network=network, **options)
+        robot, obstacles, stand = scene.robot, conditions.obstacles, Commands("live", np.zeros((1, 3)))
+        check_run(scene, stand, conditions)
+        loop = course_of(scene, stand, 0.0, conditions).loop
+        assert loop is not None
+        self.step_s, draws = loop.dt, streams(rng)
         errors = draw_wheel_errors(robot.drive, draws["drive"])
-        radius = robot.footprint_radius_m
-        self._chassis: Chassis = at_start(robot.drive, scene.start, obstacles, radius, errors, self.step_s)
+        self._chassis = Chassis(replace(loop, wheel_errors=errors), obstacles)
         self._track = Track(robot.drive, self.step_s, scene.start)
-        self._network, self._model_error, self._height_m = network, model_error, robot.base_height_m
+        self._finish, self._height_m = finish, robot.base_height_m
         self._robot, self._neighbours = robot, list[Neighbour]()
         self._sensing = Sensing(scene, draws, conditions, neighbours=self._neighbours)
         self.rate_hz = self._sensing.rate_hz
         self._scanner = Scanner(robot, obstacles, draws["lidar"])
-        self._noise_sd_nt = robot.magnetometer.noise_density_nt * np.sqrt(self.rate_hz / 2)
         self._readings = 0
         self._commands = array("d")  # three numbers a command: a live robot drives for hours
         self._metadata = {**run_metadata(self._sensing), "controller": "commands"}
@@ -170,9 +138,6 @@ class LiveRobot:
 
         Returns:
             The readings in the step's time, every column of `COLUMNS`; there may be none.
-
-        Raises:
-            InputError: The command is not finite.
         """
         self.drive(command)
         return self.read()
@@ -182,10 +147,9 @@ class LiveRobot:
         begin = self._track.end_s
         if begin == 0:
             command = (0.0, 0.0)
-        self._chassis.step(command)
+        self._track.add(self._chassis.step(command))
         if command is not None and begin > 0:
             self._commands.extend((begin, *command))
-        self._track.add(self._chassis.last)
 
     def scans(self) -> Scans:
         """The LiDAR's scans whose time lay in the last step, with the times at which they will arrive."""
@@ -206,14 +170,5 @@ class LiveRobot:
         count = int(np.ceil(until * self.rate_hz - 1e-9))
         t = np.arange(self._readings, count) / self.rate_hz
         self._readings = count
-        columns, known = self._sensing.sense(self._track, t, until), {}
-        if self._network is None:
-            predicted = None
-        else:
-            mean, sd, beyond, stated_sd = self._network(Run(columns, self._metadata))
-            predicted = mean, sd
-            known["b_sd_nt"] = np.hypot(stated_sd, self._noise_sd_nt)
-            if beyond is not None:
-                known["flag_out_of_distribution"] = beyond
-        read = self._sensing.read(columns, predicted, self._model_error)
-        return Run({**read, **known}, self._metadata, self._sensing.specs)
+        columns = self._sensing.sense(self._track, t, until)
+        return self._finish(Sensed(Run(columns, self._metadata, self._sensing.specs), self._sensing))

@@ -5,9 +5,10 @@ robot's sensors are read with the others beside it: their iron at its magnetomet
 own.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -16,11 +17,10 @@ from magtwin.errors import InputError, find
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.run.run import Run
 from magtwin.sim.motion.drive_input import DriveInput
+from magtwin.sim.runs.driving import Trip, course_of, drive, labelled
 from magtwin.sim.runs.neighbours import Approach, Neighbour, approaches
-from magtwin.sim.runs.sensing import Conditions, LidarMode, Outside, Sensing, streams
-from magtwin.sim.runs.simulate import Predict, Sensed, check_run, read_all, travel
-from magtwin.sim.sensors.model_error import ModelError
-from magtwin.spec.obstacles import Obstacles
+from magtwin.sim.runs.sensing import Conditions, Sensing, streams
+from magtwin.sim.runs.simulate import Finish, Sensed, check_run, read_all
 from magtwin.spec.scene import Scene
 
 
@@ -30,116 +30,65 @@ def simulate_robots(
     *,
     anomaly_map: AnomalyMap,
     rngs: Mapping[str, np.random.Generator],
-    wanted: Iterable[str] | None = None,
+    wanted: Collection[str] | None = None,
     meet: Literal["refuse", "flag"] = "refuse",
     speed: float = 0.2,
-    duration_s: float | None = None,
-    rate_hz: float | None = None,
-    obstacles: Obstacles | None = None,
-    controller: str = "follower",
-    disturbances_nt: Mapping[str, Predict | None] | None = None,
-    model_errors: Mapping[str, ModelError | None] | None = None,
-    outside: Outside = "nan",
-    lidar: LidarMode = "schedule",
-    complete: Callable[[str, Run], Run] = lambda name, block: block,
+    finish: Mapping[str, Finish] = MappingProxyType({}),
+    networks: Collection[str] = (),
     progress: Callable[[int, int, str], Any] | None = None,
     each: Callable[[str, Run], Any] | None = None,
+    **options: Any,
 ) -> dict[str, Run]:
-    """Drive robots of a scene at the same time, each with the kinematic engine.
+    """Drive robots of a scene at the same time, each with the kinematic engine; see `magtwin.twin.robots`.
 
     A robot's Run is that of `simulate` in `scene.led_by(name)` with the same generator, except for the
-    field of the others at its magnetometer, and the bumps.
-
-    Args:
-        scene: Lab and robots.
-        paths: What each robot drives, by its name, as for `simulate`. Robots without a path are absent.
-        anomaly_map: The map of `scene.map_layer`.
-        rngs: Source of all noise of each robot, by name.
-        wanted: Names of the robots whose sensors are read. Default: all. The others drive nevertheless.
-        meet: What happens if footprints overlap: a refusal with time and place, or flag_bump in both Runs
-            while it lasts; they drive through each other.
-        speed: As for `simulate`, of each.
-        duration_s: As for `simulate`, of each.
-        rate_hz: As for `simulate`.
-        obstacles: As for `simulate`.
-        controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`.
-        disturbances_nt: What predicts the disturbance of each robot with a neural magnetometer, by name.
-        model_errors: Statistics of the errors of these predictions, by name; None draws no error.
-        outside: As for `simulate`.
-        lidar: As for `simulate`.
-        complete: As for `simulate`, called with the robot's name and its run, or each block of a long one.
-        progress: As for `simulate`, of each run in turn.
-        each: As for `simulate`, called with the robot's name and each block of its run, if that is long.
+    field of the others at its magnetometer, and the bumps. Arguments are those of `simulate`, by the robot's
+    name where robots differ; `networks` are the robots that have one. `paths` is what each drives: robots
+    without a path are absent. `wanted` names those whose sensors are read; the others drive nevertheless.
+    `meet` is what happens if footprints overlap: "refuse" names time and place, "flag" sets flag_bump in both
+    Runs while they drive through each other.
 
     Returns:
         A Run for each wanted robot, by name. Its metadata name the robot, and the robot that came nearest,
         with clearance [m] and time [s].
-
-    Raises:
-        InputError: Robots would meet, or `simulate` would refuse one; the text names it.
     """
     if not paths:
         raise InputError("no robot is to drive; name one at least", parameter="paths")
     find("way of robots to meet", meet, {"refuse": None, "flag": None})
-    predicts = {name: (disturbances_nt or {}).get(name) for name in paths}
     led = {name: scene.led_by(name) for name in paths}
-    common = Conditions(
-        anomaly_map=anomaly_map,
-        obstacles=obstacles or Obstacles(),
-        network=False,
-        duration_s=duration_s,
-        rate_hz=rate_hz,
-        controller=controller,
-        lidar=lidar,
-        outside=outside,
-    )
-    conditions = {name: replace(common, network=predicts[name] is not None) for name in paths}
-    draws, robots, metadata = {}, {}, {}
+    common = Conditions(anomaly_map=anomaly_map, network=False, **options)
+    conditions = {name: replace(common, network=name in networks) for name in paths}
+    trips = []
     for name, path in paths.items():
-        try:
+        with labelled(f"robot {name!r}"):
             check_run(led[name], path, conditions[name])
-            draws[name] = streams(rngs[name])
-            motion, metadata[name] = travel(led[name], path, draws[name], speed, conditions[name])
-        except InputError as error:
-            raise InputError(f"robot {name!r}: {error}", parameter=error.parameter) from error
-        robots[name] = Neighbour(led[name].robot, motion)
+            course = course_of(led[name], path, speed, conditions[name])
+            trips.append(Trip(led[name], course, streams(rngs[name]), f"robot {name!r}"))
+    motions = zip(paths, drive(trips, common), strict=True)
+    robots = {name: Neighbour(led[name].robot, motion) for name, motion in motions}
     near = list(approaches(robots))
     if meet == "refuse":
         _check_apart(near)
     runs = {}
-    for name in paths if wanted is None else wanted:
-        robot, predict = find("robot", name, robots), predicts[name]
+    for name, trip in zip(paths, trips, strict=True):
+        if wanted is not None and name not in wanted:
+            continue
         others = [other for key, other in robots.items() if key != name]
-        sensing = Sensing(led[name], draws[name], conditions[name], neighbours=others)
-        own = partial(
-            _read,
-            predict=predict,
-            model_error=(model_errors or {}).get(name),
-            metadata={"robot": name, **_nearest(name, near)},
-            complete=partial(complete, name),
-        )
+        about = {"robot": name, **_nearest(name, near)}
+
+        def read(sensed: Sensed, name: str = name, about: Mapping[str, Any] = about) -> Run:
+            told = replace(sensed, run=sensed.run.with_metadata(**about))
+            return finish.get(name, Sensed.read)(told)
+
         runs[name] = read_all(
-            sensing,
-            robot.motion,
-            metadata[name],
-            own,
+            Sensing(led[name], trip.draws, conditions[name], neighbours=others),
+            robots[name].motion,
+            trip.course.metadata,
+            read,
             progress=progress,
             each=None if each is None else partial(each, name),
         )
     return runs
-
-
-def _read(
-    sensed: Sensed,
-    *,
-    predict: Predict | None,
-    model_error: ModelError | None,
-    metadata: Mapping[str, str | float],
-    complete: Callable[[Run], Run],
-) -> Run:
-    """Read the magnetometer of a run, or of a block of it."""
-    run = sensed.read(None if predict is None else predict(sensed.run), model_error)
-    return complete(run.with_metadata(**metadata))
 
 
 def _check_apart(near: Iterable[Approach]) -> None:

@@ -57,9 +57,6 @@ class Approach:
     t_s: float
     """Time of the least distance [s]."""
 
-    p_xy: tuple[float, float]
-    """Place then, midway between them [m]."""
-
     meet_s: float | None
     """Time of their first overlap [s]; None if they never overlap."""
 
@@ -79,15 +76,8 @@ def iron_moments(robot: RobotSpec, b_base_nt: ArrayLike) -> Array:
     With r u the vector from there to its magnetometer, and B = h + S b its permanent and induced field there,
     B = mu_0 / 4 pi r^3 (3 (m . u) u - m) has the solution m = 4 pi r^3 / mu_0 (3/2 (B . u) u - B).
 
-    Args:
-        robot: Its platform and magnetometer.
-        b_base_nt: Ambient field b in base_link axes [nT], shape (N, 3).
-
     Returns:
         Moments in base_link axes [A m2], shape (N, 3).
-
-    Raises:
-        InputError: Its magnetometer is at base_link's origin, so the moment is unknown.
     """
     platform, b = robot.platform, np.asarray(b_base_nt, float)
     iron = np.einsum("nk,jk->nj", b, np.reshape(platform.soft_iron, (3, 3))) + platform.hard_iron_nt
@@ -115,14 +105,6 @@ def neighbours_field_nt(
 
     (1 + S) b + E db/dt with their field b in base_link axes: the robot's soft iron and eddy currents respond
     to it as to the lab's field.
-
-    Args:
-        scene: A scene whose Earth's field is known; its first robot has the magnetometer.
-        neighbours: The other robots.
-        motion: What the first robot did.
-        t: Times of the readings, ascending [s], shape (N,).
-        true: Its motion at these times.
-        until_s: Time up to which the motions are known [s].
 
     Returns:
         Field in base_link axes [nT], shape (N, 3).
@@ -163,11 +145,7 @@ def _dipole_each_nt(r: Array, m: Array) -> Array:
 
 
 def approaches(travels: Mapping[str, Neighbour]) -> Iterator[Approach]:
-    """Nearest approach of each pair of robots, until the last has arrived; the others stand then.
-
-    Args:
-        travels: The robots by name.
-    """
+    """Nearest approach of each pair of robots, until the last has arrived; the others stand then."""
     end = max(robot.motion.duration_s for robot in travels.values())
     count, found = int(end * SEEN_HZ) + 1, dict[tuple[str, str], Approach]()
     for rows in mapped.parts(count):
@@ -184,7 +162,6 @@ def approaches(travels: Mapping[str, Neighbour]) -> Iterator[Approach]:
                 names=(a, b),
                 clearance_m=float(apart[nearest]),
                 t_s=float(t[nearest]),
-                p_xy=(float(middle[nearest, 0]), float(middle[nearest, 1])),
                 meet_s=float(t[first]) if len(met) else None,
                 p_meet=(float(middle[first, 0]), float(middle[first, 1])),
             )

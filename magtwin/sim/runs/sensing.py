@@ -75,6 +75,8 @@ class Conditions:
 
     anomaly_map: AnomalyMap
     obstacles: Obstacles = field(default_factory=Obstacles)
+    """What paths must be clear of, what stops robots, and what their LiDARs see."""
+
     network: bool
     """Whether a network predicts the disturbance."""
 
@@ -82,11 +84,18 @@ class Conditions:
     """Columns that the network reads."""
 
     duration_s: float | None = None
+    """How long to drive [s]. None for once along the path."""
+
     rate_hz: float | None = None
+    """Magnetometer readings a second [Hz]. None for the scene's."""
+
     controller: str | Controller = "follower"
     engine: Engine = KINEMATIC
     lidar: LidarMode = "schedule"
+    """Whether the LiDAR follows its schedule, or stays on or off."""
+
     outside: Outside = "nan"
+    """What the map reads outside its extent: nan, the nearest value inside, or a refusal."""
 
 
 def streams(rng: np.random.Generator) -> dict[str, np.random.Generator]:
@@ -110,17 +119,9 @@ class Sensing:
     ) -> None:
         """Switch the sensors on.
 
-        A column that is neither wanted nor an input of the network is not computed.
-
-        Args:
-            scene: Lab, robot and sensors.
-            draws: What `streams` gave.
-            conditions: Map, rate, LiDAR, and whether there is a network.
-            wanted: Columns of `COLUMNS` that the run is to have.
-            neighbours: Other robots in the lab. The magnetometer reads their iron if the Earth's field is
-                known; it is added to what a network predicts.
-            sensors: Custom sensors; see `magtwin.sim.extensions`.
-            interference: Custom interference terms, added like the iron of neighbours.
+        A column that is neither wanted nor an input of the network is not computed. The magnetometer reads
+        the iron of neighbours if the Earth's field is known; like custom interference, it is added to what a
+        network predicts.
         """
         robot = scene.robot
         spec = robot.magnetometer
@@ -136,7 +137,7 @@ class Sensing:
         self._exact = ExactField(scene=scene, anomaly_map=self._map, outside=self._outside)
         self._physical = not network and spec.kind == "physical"
         self._neighbours, self._near = neighbours, neighbours if scene.earth is not None else ()
-        self._plant = None if robot.plant == PlantSpec() else Plant(robot.plant, draws["interference"])
+        self._plant = None if robot.plant == PlantSpec() else Plant(robot.plant)
         added = bool(self._near or terms or self._plant)
         if (terms or self._plant) and self._exact.of == "none":
             what = "interference" if terms else "the robot's plant"
@@ -237,9 +238,6 @@ class Sensing:
             predicted: What a network predicts; None for a magnetometer without one.
             model_error: Statistics of the error of the prediction. None draws no error, and so does a
                 prediction without a standard deviation.
-
-        Raises:
-            InputError: The prediction has not one number for each reading.
         """
         columns, spec = dict(columns), self.scene.robot.magnetometer
         rows = len(columns["t"])

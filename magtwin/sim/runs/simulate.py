@@ -12,31 +12,19 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.path import Path, check_on_floor
 from magtwin.run.run import Run
 from magtwin.run.spool import Spool
-from magtwin.sim.engines.replay import replayed
 from magtwin.sim.exact import check_truth
 from magtwin.sim.extensions import Interference, SensorFactory
-from magtwin.sim.motion.commands import Commands
-from magtwin.sim.motion.controllers import Controller
-from magtwin.sim.motion.drive import draw_wheel_errors
 from magtwin.sim.motion.drive_input import DriveInput
-from magtwin.sim.motion.driver import Driver
-from magtwin.sim.motion.engine import KINEMATIC, Engine, Travel
-from magtwin.sim.motion.follow import follow, play
-from magtwin.sim.motion.pose_error import draw_pose_error
-from magtwin.sim.runs.sensing import Conditions, LidarMode, Outside, Predicted, Sensing, streams
+from magtwin.sim.motion.engine import Travel
+from magtwin.sim.runs.driving import Metadata, Trip, course_of, drive
+from magtwin.sim.runs.sensing import Conditions, Predicted, Sensing, streams
 from magtwin.sim.sensors.lidar import lidar_on
 from magtwin.sim.sensors.model_error import ModelError
-from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 
-Metadata = dict[str, str | int | float | bool]
-
 Predict = Callable[[Run], Predicted]
 """From a Run to what a network predicts for it."""
-
-RANDOM_S = 60.0
-"""Default time for which a random driver drives [s]."""
 
 HIGHEST_HZ = 10_000.0
 """Highest rate of a sensor beside the magnetometer [Hz]."""
@@ -52,169 +40,6 @@ FASTEST = 1e6
 
 MOST_READINGS = 20_000_000
 """Most readings of a run: about 12 GB of columns on the disk."""
-
-
-def simulate(
-    scene: Scene,
-    path: DriveInput,
-    *,
-    anomaly_map: AnomalyMap,
-    rng: np.random.Generator,
-    speed: float = 0.2,
-    duration_s: float | None = None,
-    rate_hz: float | None = None,
-    obstacles: Obstacles | None = None,
-    controller: str | Controller = "follower",
-    disturbance_nt: Predict | None = None,
-    model_error: ModelError | None = None,
-    outside: Outside = "nan",
-    lidar: LidarMode = "schedule",
-    engine: Engine | None = None,
-    sensors: Iterable[str | SensorFactory] = (),
-    interference: Iterable[str | Interference] = (),
-    complete: Callable[[Run], Run] = lambda block: block,
-    progress: Callable[[int, int, str], Any] | None = None,
-    each: Callable[[Run], Any] | None = None,
-) -> Run:
-    """Drive a scene's robot along a path and read its sensors.
-
-    b_total = b_map + b_disturbance with b_map at base_link's pose, and b_measured = b_total + b_model_error +
-    b_noise. The disturbance depends on the kind of the magnetometer. A neural one takes what `disturbance_nt`
-    predicts. A physical one takes b_truth - b_map: the exact field of the lab and of the robot at the
-    magnetometer, less the map. One of the kind "map-only" has none. `magtwin.sim.exact` defines the exact
-    field. If Earth and sources make it, b_truth and b_vector are given for all kinds; if the map does, for a
-    physical magnetometer only.
-
-    Args:
-        scene: Lab, robot and sensors.
-        path: What to drive. On a Path the robot begins at its first point, along it. Commands are played from
-            the scene's start. A Run is driven as it was recorded, and its sensors are read anew. "random" is
-            a human-like driver from the scene's start.
-        anomaly_map: The map of `scene.map_layer`.
-        rng: Source of all noise.
-        speed: Forward speed on straight parts of the path [m/s].
-        duration_s: How long to drive [s]. Default: once along the path. A longer time means further laps of a
-            closed path, and back and forth on an open one.
-        rate_hz: Magnetometer readings a second, at t = k / rate_hz [Hz]. Default: the scene's.
-        obstacles: What the path must be clear of, and what stops the robot if it leaves its path.
-        controller: A name of `magtwin.sim.motion.controllers.CONTROLLERS`, or a custom controller.
-        disturbance_nt: From a Run with all other sensors, the vector axes too, to the disturbance of each
-            reading [nT], shape (N,), alone or with the standard deviation of its error. Called once, or for
-            each block of a long run.
-        model_error: Statistics of that error; None draws no error.
-        outside: What the map reads outside its extent: nan, the nearest value inside, or a refusal.
-        lidar: Whether the LiDAR follows its schedule, or stays on or off.
-        engine: What moves the robot. Default: the kinematic engine. A Run is not moved anew.
-        sensors: Custom sensors whose columns the run has too: names of registered sensors, or factories; see
-            `magtwin.sim.extensions`.
-        interference: Custom terms that are added to the field at the magnetometer: names or functions.
-        complete: Called with the run, or with each block of a long one; returns it as it is to be kept.
-        progress: Called with readings made, readings in all and the simulated time as text, in a long run.
-        each: Called with each block of a long run, as `complete` gave it.
-
-    Returns:
-        A Run with every column of `COLUMNS`, in their order. `b_sd_nt` is nan and `flag_out_of_distribution`
-        is false, because both depend on the network.
-
-    Raises:
-        InputError: The path leaves the floor or touches an obstacle, an option is out of range, or nothing
-            gives the disturbance. Nothing has been computed then.
-    """
-    conditions = Conditions(
-        anomaly_map=anomaly_map,
-        obstacles=obstacles or Obstacles(),
-        network=disturbance_nt is not None,
-        duration_s=duration_s,
-        rate_hz=rate_hz,
-        controller=controller,
-        engine=engine or KINEMATIC,
-        lidar=lidar,
-        outside=outside,
-    )
-    check_run(scene, path, conditions)
-    draws = streams(rng)
-    sensing = Sensing(scene, draws, conditions, sensors=sensors, interference=interference)
-    motion, metadata = travel(scene, path, draws, speed, conditions)
-
-    def read(sensed: Sensed) -> Run:
-        predicted = None if disturbance_nt is None else disturbance_nt(sensed.run)
-        return complete(sensed.read(predicted, model_error))
-
-    return read_all(sensing, motion, metadata, read, progress=progress, each=each)
-
-
-def travel(
-    scene: Scene,
-    path: DriveInput,
-    draws: Mapping[str, np.random.Generator],
-    speed: float,
-    conditions: Conditions,
-) -> tuple[Travel, Metadata]:
-    """Drive the robot; returns what it did, and metadata on how. Arguments as for `simulate`."""
-    robot, duration_s, obstacles = scene.robot, conditions.duration_s, conditions.obstacles
-    controller, engine = conditions.controller, conditions.engine
-    if isinstance(path, Run):
-        kept = ("path", "controller", "speed_m_s")
-        metadata = {name: path.metadata[name] for name in kept if name in path.metadata}
-        return replayed(path, robot.drive), {**metadata, "engine": "replay"}
-    room: dict[str, Any] = {
-        "duration_s": duration_s,
-        "obstacles": obstacles,
-        "footprint_radius_m": robot.footprint_radius_m,
-        "wheel_errors": draw_wheel_errors(robot.drive, draws["drive"]),
-        "engine": engine,
-    }
-    metadata = {} if engine.name == "kinematic" else {"engine": engine.name}
-    if isinstance(path, Path):
-        name = controller if isinstance(controller, str) else type(controller).__name__
-        errors = draw_pose_error(robot.drive, draws["drive"])
-        motion = follow(path, robot.drive, speed=speed, controller=controller, pose_error=errors, **room)
-        return motion, {"path": path.name, "controller": name, "speed_m_s": float(speed), **metadata}
-    if isinstance(path, Commands):
-        motion = play(path.rows, robot.drive, start=scene.start, **room)
-        return motion, {"path": path.name, "controller": "commands", **metadata}
-    if not isinstance(path, str) or path != "random":
-        raise InputError(f'path must be a Path, Commands, a Run or "random", got {path!r}', parameter="path")
-    room["duration_s"] = RANDOM_S if duration_s is None else duration_s
-    driver = Driver(
-        robot.drive,
-        draws["driver"],
-        floor_m=scene.lab.floor_m,
-        obstacles=obstacles,
-        footprint_radius_m=robot.footprint_radius_m,
-        start=scene.start,
-        speed=speed,
-        duration_s=room["duration_s"],
-    )
-    motion = play([[0.0, 0.0, 0.0]], robot.drive, start=scene.start, controller=driver, **room)
-    return motion, {"path": "random", "controller": "driver", "speed_m_s": float(speed), **metadata}
-
-
-def check_run(scene: Scene, path: DriveInput, conditions: Conditions) -> None:
-    """Check the arguments of `simulate`.
-
-    Raises:
-        InputError: The path leaves the floor, an option is out of range, or nothing gives the disturbance.
-    """
-    robot = scene.robot
-    rate = robot.magnetometer.rate_hz if conditions.rate_hz is None else conditions.rate_hz
-    if not 0 < rate < math.inf:
-        raise InputError(
-            f"rate_hz of the magnetometer must be above 0 Hz and finite, got {rate!r}", parameter="rate_hz"
-        )
-    if not conditions.network:
-        if robot.magnetometer.kind == "neural":
-            raise InputError(
-                f"scene {scene.name!r} has a neural magnetometer, and no network predicts its disturbance; "
-                'open it as a twin that names one, or take the kind "physical" or "map-only"'
-            )
-        check_truth(scene, conditions.anomaly_map)
-    _check_numbers(robot)
-    lidar_on(robot.lidar, 0.0, conditions.lidar)  # refuses an unknown mode before anything is computed
-    if isinstance(path, Path):
-        check_on_floor(path, scene.lab.floor_m, robot.footprint_radius_m)
-    if conditions.duration_s is not None:
-        _check_readings(conditions.duration_s, rate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,15 +62,92 @@ class Sensed:
         columns = self.sensing.read(self.run.columns, predicted, model_error)
         return Run(columns, self.run.metadata, self.sensing.specs)
 
+    def predicted(self, predict: Predict, model_error: ModelError | None = None) -> Run:
+        """Read the magnetometer with what a network predicts of the other columns."""
+        return self.read(predict(self.run), model_error)
 
-def sense_all(sensing: Sensing, motion: Travel, metadata: Mapping[str, str | int | float | bool]) -> Sensed:
-    """Read the sensors of a whole run.
+
+Finish = Callable[[Sensed], Run]
+"""Makes a whole run, or a block of a long one, in which all but the magnetometer has been read."""
+
+
+def simulate(
+    scene: Scene,
+    path: DriveInput,
+    *,
+    anomaly_map: AnomalyMap,
+    rng: np.random.Generator,
+    speed: float = 0.2,
+    network: bool = False,
+    finish: Finish = Sensed.read,
+    sensors: Iterable[str | SensorFactory] = (),
+    interference: Iterable[str | Interference] = (),
+    progress: Callable[[int, int, str], Any] | None = None,
+    each: Callable[[Run], Any] | None = None,
+    **options: Any,
+) -> Run:
+    """Drive a scene's robot along a path and read its sensors; see `magtwin.twin.simulation.simulate`.
+
+    b_total = b_map + b_disturbance with b_map at base_link's pose, and b_measured = b_total + b_model_error +
+    b_noise. The disturbance depends on the kind of the magnetometer. A neural one takes what `finish`
+    gives it. A physical one takes b_truth - b_map: the exact field of the lab and of the robot at the
+    magnetometer, less the map. One of the kind "map-only" has none. `magtwin.sim.exact` defines the exact
+    field. If Earth and sources make it, b_truth and b_vector are given for all kinds; if the map does, for a
+    physical magnetometer only.
 
     Args:
-        sensing: Sensors that have not been read yet.
-        motion: What the robot did.
-        metadata: How the motion came about.
+        scene: Lab, robot and sensors.
+        path: What to drive. On a Path the robot begins at its first point, along it. Commands are played from
+            the scene's start. A Run is driven as it was recorded, and its sensors are read anew. "random" is
+            a human-like driver from the scene's start.
+        anomaly_map: The map of `scene.map_layer`.
+        rng: Source of all noise.
+        speed: Forward speed on straight parts of the path [m/s].
+        network: Whether a network predicts the disturbance.
+        finish: Reads the magnetometer of the run, or of each block of a long one, with what a network
+            predicts for it, and returns it as it is to be kept; see `Sensed`.
+        sensors: Custom sensors: names or factories; see `magtwin.sim.extensions`.
+        interference: Custom terms of the field at the magnetometer: names or functions.
+        progress: Called with readings made, readings in all and the simulated time as text, in a long run.
+        each: Called with each block of a long run, as `finish` gave it.
+        options: The fields of `Conditions` that have a default.
+
+    Returns:
+        A Run with every column of `COLUMNS`, in their order. `b_sd_nt` is nan and `flag_out_of_distribution`
+        is false, because both depend on the network.
     """
+    conditions = Conditions(anomaly_map=anomaly_map, network=network, **options)
+    check_run(scene, path, conditions)
+    draws = streams(rng)
+    sensing = Sensing(scene, draws, conditions, sensors=sensors, interference=interference)
+    course = course_of(scene, path, speed, conditions)
+    (motion,) = drive([Trip(scene, course, draws)], conditions)
+
+    return read_all(sensing, motion, course.metadata, finish, progress=progress, each=each)
+
+
+def check_run(scene: Scene, path: DriveInput, conditions: Conditions) -> None:
+    """Check the arguments of `simulate`."""
+    robot = scene.robot
+    rate = robot.magnetometer.rate_hz if conditions.rate_hz is None else conditions.rate_hz
+    check_asked(conditions.duration_s, rate)
+    if not conditions.network:
+        if robot.magnetometer.kind == "neural":
+            raise InputError(
+                f"scene {scene.name!r} has a neural magnetometer, and no network predicts its disturbance; "
+                'open it as a twin that names one, or take the kind "physical" or "map-only"'
+            )
+        check_truth(scene, conditions.anomaly_map)
+    _check_numbers(robot)
+    lidar_on(robot.lidar, 0.0, conditions.lidar)  # refuses an unknown mode before anything is computed
+    if isinstance(path, Path):
+        check_on_floor(path, scene.lab.floor_m, robot.footprint_radius_m)
+    if conditions.duration_s is not None:
+        _check_readings(conditions.duration_s, rate)
+
+
+def sense_all(sensing: Sensing, motion: Travel, metadata: Mapping[str, str | int | float | bool]) -> Sensed:
+    """Read the sensors of a whole run."""
     count, known = readings(sensing, motion, metadata)
     t = np.arange(count) / sensing.rate_hz
     return Sensed(Run(sensing.sense(motion, t), known, sensing.specs), sensing)
@@ -255,26 +157,17 @@ def read_all(
     sensing: Sensing,
     motion: Travel,
     metadata: Mapping[str, str | int | float | bool],
-    read: Callable[[Sensed], Run],
+    finish: Finish,
     *,
     progress: Callable[[int, int, str], Any] | None = None,
     each: Callable[[Run], Any] | None = None,
 ) -> Run:
-    """Read the sensors of a whole run, a long one block by block; the bytes do not depend on the blocks.
-
-    Args:
-        sensing: Sensors that have not been read yet.
-        motion: What the robot did.
-        metadata: How the motion came about.
-        read: Reads the magnetometer of the run, or of a block.
-        progress: Called after each block with readings made, readings in all and the simulated time as text.
-        each: Called with each block of a long run.
-    """
+    """Read the sensors of a whole run, a long one block by block; the bytes do not depend on the blocks."""
     count, known = readings(sensing, motion, metadata)
     whole, rows = Spool(count), sensing.rows_at_once(count)
     for first in range(0, count, rows):
         t = np.arange(first, min(first + rows, count)) / sensing.rate_hz
-        block = read(Sensed(Run(sensing.sense(motion, t), known, sensing.specs), sensing))
+        block = finish(Sensed(Run(sensing.sense(motion, t), known, sensing.specs), sensing))
         whole.append(block)
         if rows == count:
             break
@@ -342,15 +235,13 @@ def _check_numbers(robot: RobotSpec) -> None:
             raise InputError(f"robot {robot.name!r}: {text}")
 
 
-def check_asked(speed: float, duration_s: float | None, rate_hz: float | None) -> None:
+def check_asked(duration_s: float | None, rate_hz: float | None, speed: float = 0.2) -> None:
     """Refuse values that no robot allows. It needs no scene, so it comes before one is opened."""
     if not 0 < speed <= FASTEST:
         text = f"speed must be above 0 m/s and at most the drive's v_max, got {speed!r}"
         raise InputError(text, parameter="speed")
-    for value, what, unit in (
-        (duration_s, "duration_s", "s"),
-        (rate_hz, "rate_hz of the magnetometer", "Hz"),
-    ):
+    asked = (duration_s, "duration_s", "s"), (rate_hz, "rate_hz of the magnetometer", "Hz")
+    for value, what, unit in asked:
         if value is not None and not 0 < value < math.inf:
             text = f"{what} must be above 0 {unit} and finite, got {value!r}"
             raise InputError(text, parameter=what.partition(" ")[0])
@@ -358,10 +249,6 @@ def check_asked(speed: float, duration_s: float | None, rate_hz: float | None) -
 
 def _check_readings(duration_s: float, rate_hz: float) -> None:
     """Refuse a run whose columns no memory can hold, or a rate of no magnetometer."""
-    if not math.isfinite(duration_s):
-        raise InputError(
-            f"duration_s must be above 0 s and finite, got {duration_s!r}", parameter="duration_s"
-        )
     if duration_s * rate_hz > MOST_READINGS:
         raise InputError(
             f"{duration_s:g} s at {rate_hz:g} Hz make {duration_s * rate_hz:.3g} readings, more than "

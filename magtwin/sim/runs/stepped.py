@@ -7,8 +7,10 @@ rate. A robot depends only on its own commands and generator, not on the robots 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -19,13 +21,11 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import into_base
 from magtwin.run.run import Run
 from magtwin.sim.exact import ExactField, check_truth
-from magtwin.sim.interference import TORQUE_S, platforms_of_rows, rest_current_a, torques_nm
+from magtwin.sim.interference import TORQUE_S, platforms_of_rows
 from magtwin.sim.motion import loop
-from magtwin.sim.motion.closed_loop import LOOPS, ClosedLoop, fence_of
-from magtwin.sim.motion.controllers import guide_by_commands
+from magtwin.sim.motion.closed_loop import LOOPS, Robots
 from magtwin.sim.motion.drive import Moment, Pose, draw_wheel_errors, wheel_rates
-from magtwin.sim.motion.follow import CONTROL_RATE_HZ
-from magtwin.sim.plant import Plant
+from magtwin.sim.motion.follow import CONTROL_RATE_HZ, STAND, loop_by_commands
 from magtwin.sim.runs.sensing import streams, truth
 from magtwin.sim.runs.simulate import Predict
 from magtwin.sim.sensors.battery import Battery, wheels_energy_j
@@ -78,22 +78,7 @@ class SteppedRobots:
         disturbance_nt: Predict | None = None,
         model_error: ModelError | None = None,
     ) -> None:
-        """Make room for robots; `begin` must place each before its first step.
-
-        Args:
-            scene: Lab, robot and sensors.
-            count: How many robots.
-            anomaly_map: The map of the scene; outside its extent it reads the nearest value.
-            obstacles: What stops the robots.
-            step_s: Length of a step [s], a multiple of the control step.
-            disturbance_nt: From a table to the disturbance of a neural magnetometer and the standard
-                deviation of its error.
-            model_error: Statistics of that error, drawn for each robot each time that it begins; None draws
-                no error.
-
-        Raises:
-            InputError: `count` or `step_s` is out of range, or nothing gives the disturbance.
-        """
+        """Make room for robots; `begin` must place each before its first step."""
         kind, timeout = scene.robot.magnetometer.kind, scene.robot.drive.command_timeout_s
         if not isinstance(count, int) or count < 1:
             raise InputError(f"the number of robots must be a whole number from 1 up, got {count!r}")
@@ -112,15 +97,12 @@ class SteppedRobots:
         self._map, self._obstacles, self._disturbance_nt = anomaly_map, obstacles, disturbance_nt
         self._exact = ExactField(scene=scene, anomaly_map=anomaly_map, outside="clamp")
         self._model_error = model_error
-        self._planted = scene.robot.plant != PlantSpec()
-        if self._planted and self._exact.of == "none":
+        if scene.robot.plant != PlantSpec():
             raise InputError(
-                f"scene {scene.name!r} has a constant map and no Earth field, so the robot's plant has "
-                "nothing to add to; give the scene an Earth field"
+                f"robot {scene.robot.name!r} has a plant, which only runs simulate; leave it out"
             )
-        self._fence = fence_of(obstacles)
-        self._drive = _compiled_or_plain()
-        self._figures, self._state = np.zeros((count, loop.FIGURES)), np.zeros((count, loop.STATE))
+        self._code = _compiled()
+        self._moved = Robots([loop_by_commands(STAND, scene.robot.drive)] * count, obstacles)
         self._record = np.zeros((count, loop.RECORD, self._steps))
         self._t, self._angle, self._twist = np.zeros(count), np.zeros((count, 2)), np.zeros((count, 2))
         self._robots, self._lidar_s, self._offset = [scene.robot] * count, np.zeros(count), np.zeros(count)
@@ -134,9 +116,7 @@ class SteppedRobots:
         """The sensors of a robot that begins."""
         rate, spec = 1 / self.step_s, replace(robot.magnetometer, flicker_corner_hz=0.0)
         time_s = self._model_error.time_s if self._model_error else 0.0
-        plant = {"plant": Plant(robot.plant, draws["interference"])} if self._planted else {}
         return {
-            **plant,
             "odometry": Odometry(robot.drive, draws["odometry"], rate_hz=rate),
             "imu": Imu(robot.imu, robot.q_base_imu_xyzw, draws["imu"], rate_hz=rate),
             "battery": Battery(
@@ -158,33 +138,19 @@ class SteppedRobots:
         rngs: Sequence[np.random.Generator],
         robots: Sequence[RobotSpec] | None = None,
     ) -> None:
-        """Place robots at rest, with the draws of a new run; the others stay as they are.
-
-        Args:
-            which: Numbers of the robots.
-            poses: x [m], y [m], yaw [rad] in world of each.
-            rngs: Source of all noise of each until it begins again.
-            robots: The scene's robot in the session of each, as `magtwin.sim.session.draw_session` gives it.
-                Default: the scene's robot.
-
-        Raises:
-            InputError: A robot would begin in an obstacle.
-        """
+        """Place robots at rest, with the draws of a new run; the others stay as they are."""
         sessions = [self.scene.robot] * len(which) if robots is None else robots
         for i, pose, rng, robot in zip(which, poses, rngs, sessions, strict=True):
             draws = streams(rng)
-            start = ClosedLoop(
-                drive=robot.drive,
-                guide=guide_by_commands([[0.0, 0.0, 0.0]], robot.drive),
-                dt=1 / CONTROL_RATE_HZ,
-                pose0=pose,
-                steps=self._steps,
+            start = loop_by_commands(
+                STAND,
+                robot.drive,
+                start=pose,
                 footprint_radius_m=robot.footprint_radius_m,
                 wheel_errors=draw_wheel_errors(robot.drive, draws["drive"]),
             )
             start.check(self._obstacles)
-            self._figures[i], self._state[i] = start.figures(), start.state()
-            self._state[i, 8] = 0.0 if len(self._obstacles) else np.inf
+            self._moved.put(i, start)
             if self._model_error is not None:
                 self._offset[i] = self._model_error.in_session(draws["model_error"]).offset
             for name, sensor in self._sensors(robot, draws).items():
@@ -202,9 +168,6 @@ class SteppedRobots:
         Args:
             commands: Forward speed [m/s] and yaw rate [rad/s] of each, shape (count, 2).
             which: Numbers of the robots. Default: all. The others stay as they are.
-
-        Raises:
-            InputError: A command is not finite, or they are not of that shape.
         """
         twists = np.asarray(commands, float)
         if twists.shape != (self.count, 2) or not np.isfinite(twists).all():
@@ -213,17 +176,9 @@ class SteppedRobots:
                 f"{twists.shape}, {np.count_nonzero(~np.isfinite(twists))} of them not finite"
             )
         rows = np.arange(self.count) if which is None else np.asarray(which, np.int64)
-        count = len(rows)
-        if not count:
+        if not len(rows):
             return
-        each, tables = np.arange(count, dtype=np.int64), np.zeros((loop.TABLE, count))
-        tables[1:3] = twists[rows].T
-        laws, made = np.full(count, loop.COMMANDS, np.int64), np.zeros(count, np.int64)
-        state, record = self._state[rows], np.zeros((count, loop.RECORD, self._steps))
-        state[:, 10] = 0.0
-        figures = self._figures[rows]
-        self._drive(laws, figures, tables, each, each + 1, *self._fence, state, 0, self._steps, record, made)
-        self._state[rows], self._record[rows] = state, record
+        self._record[rows], _ = self._moved.step(0, self._steps, rows, twists=twists[rows], code=self._code)
         self._t[rows] += self.step_s
         self._sense(rows, moved=True)
 
@@ -304,12 +259,8 @@ class SteppedRobots:
             if self._model_error is not None:
                 process = sensed["error"].next(1)[0]
                 error = self._model_error.error_nt(sd, process, self._offset[which])
-            if self._planted:
-                plain, whole = self._exact_nt(which, now, table, supply_a, b_map, sensed)
-                disturbance = disturbance + np.nan_to_num(_sizes(whole) - _sizes(plain))
         elif spec.kind == "physical":
-            _, field = self._exact_nt(which, now, table, supply_a, b_map, sensed)
-            disturbance = _sizes(field) - b_map
+            disturbance = _sizes(self._exact_nt(which, now, table, supply_a, b_map)) - b_map
             disturbance = np.nan_to_num(disturbance)  # a map of one heading is read beside b_map's place
         else:
             disturbance = np.zeros(len(which))
@@ -323,41 +274,19 @@ class SteppedRobots:
         }
 
     def _exact_nt(
-        self,
-        which: NDArray[np.intp],
-        now: Moment,
-        table: Columns,
-        supply_a: Array,
-        b_map: Array,
-        sensed: dict[str, Any],
-    ) -> tuple[Array, Array]:
-        """The exact field without the plant and with it in base_link axes [nT], shape (N, 3) each."""
-        scene, ambient = self._scene_of(which), None
+        self, which: NDArray[np.intp], now: Moment, table: Columns, supply_a: Array, b_map: Array
+    ) -> Array:
+        """The exact field in base_link axes [nT], shape (N, 3)."""
         past = _Past(self._moment(which, max(self._steps - 1 - round(TORQUE_S * CONTROL_RATE_HZ), 0)))
-        t = np.maximum(self._t[which], TORQUE_S)  # rows are robots, so times are in no order
-        if self._planted:
-            ambient = self._exact.ambient_nt(scene, now, b_map)
-        field = self._exact.at_sensor_nt(
-            scene,
+        return self._exact.at_sensor_nt(
+            self._scene_of(which),
             past,
-            t,
+            np.maximum(self._t[which], TORQUE_S),  # rows are robots, so times are in no order
             true=now,
             lidar_on=table["lidar_on"],
             supply_a=supply_a,
             at_rest_nt=b_map,
-            ambient=ambient,
         )
-        if ambient is None:
-            return field, field
-        added = sensed["plant"].field_nt(
-            self._t[which][None],
-            ambient[0][None],
-            torques_nm=torques_nm(scene.robot, past, t, now)[None],
-            speed=now.v[None],
-            lidar_on=table["lidar_on"][None],
-            supply_a=supply_a[None] - rest_current_a(scene.robot.battery),
-        )
-        return field, field + added[0]
 
     def _scene_of(self, which: NDArray[np.intp]) -> Scene:
         """The scene with the platforms of some robots in their sessions, a row each."""
@@ -382,10 +311,8 @@ def _stacked_moments(moments: Sequence[Moment]) -> Moment:
 _PARTS = tuple(Moment.__dataclass_fields__)
 
 
-def _compiled_or_plain() -> Callable[..., None]:
-    """The loop for arrays, compiled if numba works; the bytes are the same."""
-    try:
-        robots: Callable[..., None] = LOOPS.open().robots
-    except ImportError:
-        robots = loop.robots
-    return robots
+def _compiled() -> ModuleType | None:
+    """The compiled loop; None for plain Python, where numba does not work. The bytes are the same."""
+    with suppress(ImportError):
+        return LOOPS.open()
+    return None

@@ -1,7 +1,8 @@
 """Battery: the power that the robot, its LiDAR and its electronics draw, and the charge that is left."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -60,8 +61,7 @@ def wheels_energy_j(spec: BatterySpec, drive: DriveSpec, moments: Moment) -> Arr
     return joules
 
 
-@dataclass(frozen=True, eq=False)
-class Discharge:
+class Discharge(NamedTuple):
     """Successive steps of a pack; arrays of shape (K, ...)."""
 
     power_w: Array
@@ -93,14 +93,7 @@ class Battery(SampledSensor):
         lidar_on: Callable[[Array], NDArray[np.bool_]],
         rng: np.random.Generator,
     ) -> None:
-        """Begin at rest with the spec's charge.
-
-        Args:
-            spec: Pack, loads, rate, delays and noise.
-            drive: The wheels that are driven.
-            lidar_on: From times [s] to whether the LiDAR spins.
-            rng: Source of delays and noise.
-        """
+        """Begin at rest with the spec's charge."""
         delays, noise = rng.spawn(2)
         super().__init__(noise, spent=0.0, initial=spec.initial_fraction)
         if spec.model == "linear":
@@ -155,8 +148,7 @@ class Battery(SampledSensor):
 
     def sample(self, stamps: Array, now: Moment) -> Columns:
         """As for `SampledSensor`, for one robot."""
-        power, fraction, voltage, current = self._states(stamps).T
-        return self.readings(Discharge(power, fraction, voltage, current))
+        return self.readings(Discharge(*self._states(stamps).T))
 
     def supply_a(self, t: Array) -> Array:
         """Current drawn at the times of the last call of `sense` [A]."""
@@ -166,7 +158,7 @@ class Battery(SampledSensor):
         """Discharge the pack in the steps that end before a time, and keep their states."""
         if self._history is None:
             start = self.rest(self._lidar_on(np.zeros(1)))
-            self._history = np.column_stack([start.power_w, start.fraction, start.voltage_v, start.current_a])
+            self._history = np.column_stack(start)
         else:
             self._history = self._history[-2:]  # steps go on past the last reading, by less than one
             self._first = self._done - len(self._history) + 1
@@ -176,8 +168,7 @@ class Battery(SampledSensor):
         if len(times) > 1:
             energy = wheels_energy_j(self.spec, self._drive, motion.at(times))
             steps = self.draw(energy, self._lidar_on(times[:-1]), STEP_S)
-            rows = np.column_stack([steps.power_w, steps.fraction, steps.voltage_v, steps.current_a])
-            self._history = np.concatenate([self._history, rows])
+            self._history = np.concatenate([self._history, np.column_stack(steps)])
 
     def _states(self, t: Array) -> Array:
         """The state at times [s]: that after the last step that has ended; shape (N, 4)."""

@@ -47,14 +47,7 @@ class SampleClock:
     def __init__(
         self, rate_hz: float, latency_s: float, jitter_s: float, rng: np.random.Generator | None = None
     ) -> None:
-        """Set the clock to the first sample that a reading at t = 0 can see.
-
-        Args:
-            rate_hz: Samples a second [Hz].
-            latency_s: Time that each sample takes to arrive [s].
-            jitter_s: Mean of the further delay of each sample [s].
-            rng: Source of the delays; not needed if `jitter_s` is 0.
-        """
+        """Set the clock to the first sample that a reading at t = 0 can see."""
         self.rate_hz, self._latency, self._jitter, self._rng = rate_hz, latency_s, jitter_s, rng
         self._next = -math.ceil(min(latency_s * rate_hz, 1e18))
         self._first, self._last = self._next, -math.inf
@@ -63,11 +56,7 @@ class SampleClock:
         self._fresh: list[Samples] = []
 
     def due(self, until_s: float) -> Array:
-        """Times of the samples before `until_s` that have not been taken yet [s], shape (M,).
-
-        Raises:
-            InputError: There are more than memory can hold.
-        """
+        """Times of the samples before `until_s` that have not been taken yet [s], shape (M,)."""
         check_count("samples of a sensor", until_s - self._next / self.rate_hz, self.rate_hz)
         last = math.ceil(until_s * self.rate_hz - _TOLERANCE)
         stamps = np.arange(self._next, max(last, self._next)) / self.rate_hz

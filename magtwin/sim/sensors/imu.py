@@ -36,14 +36,7 @@ class Imu(SampledSensor):
         *,
         rate_hz: float | None = None,
     ) -> None:
-        """Switch the sensor on.
-
-        Args:
-            spec: Rate, delays, zero, bias, tilt and noise.
-            q_base_imu_xyzw: The sensor's axes in base_link.
-            rng: Source of delays and noise.
-            rate_hz: Samples a second [Hz]. Default: the spec's.
-        """
+        """Switch the sensor on."""
         delays, noise = rng.spawn(2)
         super().__init__(
             noise,

@@ -37,9 +37,6 @@ def lidar_on(
         spec: The schedule: off for off_s, on for on_s, and so on; at t = 0 it is at phase_s.
         t: Times since the start [s].
         mode: "schedule", or always "on" or "off".
-
-    Raises:
-        InputError: `mode` is another word.
     """
     t = np.asarray(t, float)
     if mode == "schedule":
@@ -127,14 +124,7 @@ class Scanner:
     def __init__(
         self, robot: RobotSpec, obstacles: Obstacles, rng: np.random.Generator, *, begin_s: float = 0.0
     ) -> None:
-        """Begin a turn.
-
-        Args:
-            robot: Its LiDAR, and where it is mounted.
-            obstacles: What there is to see.
-            rng: Source of delays and noise.
-            begin_s: Time of the first scan [s].
-        """
+        """Begin a turn."""
         self._robot, self._obstacles, self._begin_s = robot, obstacles, begin_s
         self._delays, self._noise = rng.spawn(2)
         self._next, self._arrived = 0, -np.inf
@@ -146,13 +136,7 @@ class Scanner:
         poses: Callable[[Array], Array],
         lidar_on: Callable[[Array], NDArray[np.bool_]],
     ) -> Scans:
-        """The scans whose time comes before `until_s`, with the times at which they arrive.
-
-        Args:
-            until_s: End of the time [s].
-            poses: From times [s] to x [m], y [m], height [m], yaw [rad] of base_link, shape (N, 4).
-            lidar_on: From times [s] to whether the LiDAR spins.
-        """
+        """The scans whose time comes before `until_s`, with the times at which they arrive."""
         spec, robot = self._robot.lidar, self._robot
         last = int(np.ceil((until_s - self._begin_s) * spec.scan_rate_hz - 1e-9))
         stamps = self._begin_s + np.arange(self._next, max(last, self._next)) / spec.scan_rate_hz
@@ -184,17 +168,7 @@ class Scanner:
 
 
 def scans_of(run: Run, robot: RobotSpec, obstacles: Obstacles, rng: np.random.Generator) -> Scans:
-    """The scans of a LiDAR in a run, one per turn while it spun.
-
-    Args:
-        run: With t, p_world_base, yaw and lidar_on: simulated or recorded.
-        robot: Its LiDAR, and where it is mounted.
-        obstacles: What there is to see.
-        rng: Source of delays and noise.
-
-    Raises:
-        InputError: There are more scans than memory can hold.
-    """
+    """The scans of a LiDAR in a run, one per turn while it spun."""
     t, base, yaw = run["t"], run["p_world_base"], np.unwrap(run["yaw"])
     check_count("a LiDAR's scans", t[-1] - t[0], robot.lidar.scan_rate_hz)
 
@@ -242,10 +216,6 @@ def _cast(segments: Array, rays: int) -> Array:
     """Range to the first segment along each ray from the origin, inf if there is none, shape (rays,).
 
     A segment is met by the rays between the directions to its ends.
-
-    Args:
-        segments: Their ends [m], shape (C, 2, 2).
-        rays: Number of rays, see `ray_angles`.
     """
     a, b = segments[:, 0], segments[:, 1]
     cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

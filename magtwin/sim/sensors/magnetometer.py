@@ -40,13 +40,7 @@ class Magnetometer(Stateful):
     """
 
     def __init__(self, spec: MagnetometerSpec, rate_hz: float, rng: np.random.Generator) -> None:
-        """Switch the sensor on.
-
-        Args:
-            spec: The sensor.
-            rate_hz: Readings a second [Hz].
-            rng: Source of noise.
-        """
+        """Switch the sensor on."""
         noise, self._vector_rng, self._stuck_rng, self._drop_rng = rng.spawn(4)
         noisy = bool(spec.noise_density_nt and spec.flicker_corner_hz)
         self._corners_hz = flicker_corners_hz(rate_hz) if noisy else []
@@ -244,13 +238,6 @@ def stuck_nt(
     before: float = math.nan,
 ) -> Array:
     """The value at which readings are stuck, drawn anew each time that lock is lost.
-
-    Args:
-        spec: Its mean and spread.
-        lost: Whether lock is lost, in the order of time, shape (N,).
-        rng: Source of the values.
-        was_lost: Whether lock was lost before the first.
-        before: The value then [nT].
 
     Returns:
         Readings [nT], shape (N,); meaningful if lock is lost.

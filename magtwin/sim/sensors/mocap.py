@@ -21,13 +21,7 @@ class Mocap(SampledSensor):
     """
 
     def __init__(self, spec: MocapSpec, height_m: float, rng: np.random.Generator) -> None:
-        """Begin before the first sample.
-
-        Args:
-            spec: Rate, delays, offset, noise, and how often and how long the markers are not seen.
-            height_m: Height of base_link above the floor [m].
-            rng: Source of delays, noise and dropouts.
-        """
+        """Begin before the first sample."""
         delays, noise, gaps = rng.spawn(3)
         super().__init__(noise)
         self._spec, self._height = spec, height_m
@@ -60,24 +54,12 @@ class Dropouts:
     """Which samples are lost: times of sight and dropouts alternate, each exponentially distributed."""
 
     def __init__(self, spec: MocapSpec, rng: np.random.Generator) -> None:
-        """Begin in sight.
-
-        Args:
-            spec: Mean length of a dropout, and of the time between two.
-            rng: Source of the lengths.
-        """
+        """Begin in sight."""
         self._means_s, self._rng = (spec.dropout_every_s, spec.dropout_s), rng
         self._edges = np.zeros(0)
 
     def lost(self, stamps: ArrayLike) -> NDArray[np.bool_]:
-        """Whether each of the next samples is lost; the first of all is not.
-
-        Args:
-            stamps: Their times [s], shape (N,).
-
-        Raises:
-            InputError: There are more dropouts than memory can hold.
-        """
+        """Whether each of the next samples is lost; the first of all is not."""
         stamps = np.asarray(stamps, float)
         if not all(self._means_s) or not len(stamps):
             return np.zeros(len(stamps), bool)

@@ -54,10 +54,5 @@ class ModelError:
         return np.asarray(constant * o + rest * np.asarray(process, float))
 
     def process(self, rng: np.random.Generator, rate_hz: float) -> GaussMarkov:
-        """The process u of successive readings, of correlation time `time_s`.
-
-        Args:
-            rng: Source of the process.
-            rate_hz: Readings a second [Hz].
-        """
+        """The process u of successive readings, of correlation time `time_s`."""
         return GaussMarkov(rng, self.time_s, rate_hz)

@@ -21,13 +21,7 @@ class Odometry(SampledSensor):
     """
 
     def __init__(self, drive: DriveSpec, rng: np.random.Generator, *, rate_hz: float | None = None) -> None:
-        """Begin at the origin.
-
-        Args:
-            drive: The wheels as the robot knows them, rate, delays and noise.
-            rng: Source of the two factors, the delays and the noise.
-            rate_hz: Samples a second [Hz]. Default: `odometry_rate_hz`.
-        """
+        """Begin at the origin."""
         delays, noise = rng.spawn(2)
         factors = np.array(drive.odometry_scale) * (1.0 + drive.odometry_noise_std * rng.standard_normal(2))
         super().__init__(noise, factors=factors, angle=np.full(2, np.nan), yaw=0.0, xy=np.zeros(2))

@@ -19,12 +19,7 @@ class Stateful:
     """
 
     def __init__(self, rng: np.random.Generator, **state: ArrayLike) -> None:
-        """Begin with a state.
-
-        Args:
-            rng: Source of all noise.
-            state: What changes from sample to sample or differs between robots, by name.
-        """
+        """Begin with a state."""
         self.rngs = [rng]
         self.state: dict[str, Array] = {name: np.array(value, float) for name, value in state.items()}
         self._many = False

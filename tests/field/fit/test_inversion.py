@@ -306,7 +306,8 @@ def test_a_drive_with_headings_all_around_has_no_gaps_between_them():
 @pytest.mark.slow
 def test_in_the_default_lab_it_is_four_times_nearer_to_the_exact_field_than_trilinear(lab_scene):
     from magtwin.field.survey.stuck import mask_stuck
-    from magtwin.sim.survey import field_at_rest_nt, survey_readings
+    from magtwin.sim.at_rest import field_at_rest_nt
+    from magtwin.sim.survey import survey_readings
     from magtwin.usd.scene import read_scene
 
     scene = read_scene(lab_scene)

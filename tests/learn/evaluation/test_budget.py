@@ -15,7 +15,7 @@ from magtwin.learn.evaluation.budget import TERMS, Truth, at_rest_nt, budget
 from magtwin.learn.evaluation.candidates import naive, named_map, tolles_lawson
 from magtwin.learn.evaluation.evaluate import evaluate
 from magtwin.run.run import Run
-from magtwin.sim.survey import field_at_rest_nt
+from magtwin.sim.at_rest import field_at_rest_nt
 from magtwin.twin import check_scene, in_session_of, open_twin, simulate
 
 SEED = 11

@@ -3,13 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from magtwin.errors import InputError
-from magtwin.sim.motion.drive import Motion, advance, integrate_twist, limiter, wheel_rates
+from magtwin.sim.motion.drive import Motion, integrate_twist, limiter, wheel_rates
 from magtwin.spec.drive import DriveSpec
 
 DRIVE = DriveSpec()
@@ -22,25 +20,6 @@ def test_a_constant_twist_goes_round_a_circle_of_radius_v_over_w_whatever_the_st
         poses = integrate_twist([v] * steps, [w] * steps, 2 * np.pi / w / steps)
         assert_allclose(np.hypot(poses[:, 0], poses[:, 1] - v / w), v / w, rtol=1e-12)
         assert_allclose(poses[-1], [0, 0, 2 * np.pi], atol=1e-12)
-
-
-@given(v=speeds, w=turns)
-def test_driving_there_and_back_ends_at_the_start(v, w):
-    assert_allclose(integrate_twist([v, -v], [w, -w], dt=0.1)[-1], 0, atol=1e-12)
-
-
-@given(v=speeds, w=turns, parts=st.integers(1, 9))
-def test_a_step_in_parts_is_the_step(v, w, parts):
-    pose = whole = np.array([0.3, -0.2, 1.0])
-    for _ in range(parts):
-        pose = advance(pose, v, w, 1.0 / parts)
-    assert_allclose(pose, advance(whole, v, w, 1.0), atol=1e-12)
-
-
-@given(v=speeds, w=turns)
-def test_rims_go_forward_by_their_mean_and_turn_by_their_difference(v, w):
-    left, right = wheel_rates(v, w, DRIVE) * DRIVE.wheel_radius_m
-    assert_allclose([(left + right) / 2, (right - left) / DRIVE.wheel_separation_m], [v, w], atol=1e-12)
 
 
 def test_the_wheels_of_a_circle_roll_along_circles_half_a_separation_apart():
@@ -59,20 +38,6 @@ def test_a_motion_between_its_steps_is_exact():
     t = np.arange(400) * 0.002 + 1e-9  # just inside the fine steps
     assert_allclose(coarse.at(t).pose, fine.at(t).pose, atol=1e-12)
     assert_allclose(coarse.at(t).wheel_angle, fine.at(t).wheel_angle, atol=1e-10)
-
-
-def test_a_motion_stands_still_after_its_last_step():
-    motion = Motion(DRIVE, 0.02, np.full(10, 0.2), np.full(10, 1.0))
-    late = motion.at([0.2, 5.0])
-    assert_allclose(late.pose, motion.poses[[-1, -1]], atol=1e-15)
-    assert_allclose([late.v, late.w, late.a], 0)
-
-
-def test_acceleration_sums_up_to_speed():
-    v = np.array([0.01, 0.02, 0.02, 0.0])
-    motion = Motion(DRIVE, 0.02, v, np.zeros(4))
-    a = motion.at(np.arange(4) * 0.02 + 0.01).a
-    assert_allclose(np.cumsum(a) * 0.02, v, atol=1e-15)
 
 
 @given(
@@ -106,45 +71,3 @@ def test_no_wheel_turns_faster_than_it_can_and_turning_goes_before_speed(wanted,
         assert top >= drive.wheel_rate_max * (1 - 1e-12)
     if w != free_w:  # only where speed already gives way as quickly as it may
         assert abs(v) <= max(abs(last[0]) - drive.a_max * dt, 0.0) + 1e-12
-
-
-def test_a_motion_refuses_twists_that_are_not_finite_or_do_not_match():
-    with pytest.raises(InputError, match="speed or yaw rate of a Motion is not finite"):
-        Motion(DRIVE, 0.02, np.array([np.nan]), np.zeros(1))
-    with pytest.raises(InputError, match=r"one shape \(K,\)"):
-        Motion(DRIVE, 0.02, np.zeros(2), np.zeros(3))
-    with pytest.raises(InputError, match=r"one shape \(K,\)"):
-        Motion(DRIVE, 0.02, np.zeros(0), np.zeros(0))
-    with pytest.raises(InputError, match=r"wheel_v of a Motion must have shape \(2,\), got \(3,\)"):
-        Motion(DRIVE, 0.02, np.zeros(2), np.zeros(2), wheel_v=np.zeros(3))
-    with pytest.raises(InputError, match=r"poses of a Motion must have shape \(3, 3\), got \(2, 3\)"):
-        Motion(DRIVE, 0.02, np.zeros(2), np.zeros(2), poses=np.zeros((2, 3)))
-
-
-def test_an_ideal_motion_was_commanded_as_it_went_and_touched_nothing():
-    motion = Motion(DRIVE, 0.02, np.array([0.1, 0.2]), np.array([0.0, 0.5]))
-    seen = motion.at([0.0, 0.03, 9.0])
-    assert_allclose(seen.v_cmd, [0.1, 0.2, 0.0])
-    assert_allclose(seen.w_cmd, [0.0, 0.5, 0.0])
-    assert not seen.bump.any()
-
-
-def test_wheels_that_slip_turn_more_than_the_robot_goes():
-    motion = Motion(DRIVE, 0.02, np.full(9, 0.2), np.zeros(9), wheel_v=np.full(9, 0.25))
-    assert_allclose(motion.at([0.1]).wheel_angle, [[0.25 * 0.1 / 0.03575] * 2], rtol=1e-12)
-    assert_allclose(motion.at([0.1]).pose, [[0.02, 0.0, 0.0]], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("figure", "value", "says"),
-    [
-        ("yaw_slip", 1.0, "yaw_slip of DriveSpec must be at least 0 and below 1"),
-        ("slip_s2_m", 1.2, r"slip_s2_m of DriveSpec must be below 1 when multiplied by a_max 0\.9"),
-        ("motor_lag_s", -0.1, "motor_lag_s of DriveSpec must not be below 0"),
-        ("wheel_rate_max", 0.0, "wheel_rate_max of DriveSpec must be above 0"),
-        ("motor_lag_s", float("nan"), "motor_lag_s of DriveSpec must be finite"),
-    ],
-)
-def test_a_drive_that_cannot_be_is_refused(figure, value, says):
-    with pytest.raises(InputError, match=says):
-        replace(DRIVE, **{figure: value})

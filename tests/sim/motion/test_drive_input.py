@@ -7,15 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
-from magtwin.files.file import shipped
-from magtwin.io.formats import read_run, write_run
-from magtwin.path import Path, path_named, path_of_points, read_path_csv
+from magtwin.path import Path, path_named
 from magtwin.run.run import Run
-from magtwin.sim.motion.commands import Commands
 from magtwin.sim.motion.drive_input import drive_input, drive_inputs
-from magtwin.twin import open_twin, scan, scene_from_toml, simulate, simulate_robots, sweep
+from magtwin.twin import open_twin, simulate, simulate_robots, sweep
 from magtwin.usd.scene import read_scene
 
 POINTS = [[-1.0, -0.5], [0.25, 0.5], [1.0, 0.125], [0.5, -0.75]]
@@ -44,32 +40,6 @@ def test_scene_twin_and_file_give_equal_bytes(lab_scene, twin):
     assert metadata[0] == metadata[1]
     assert metadata[0].keys() - metadata[2].keys() <= {"scene_file", "git_revision"}
     assert all(metadata[0][name] == value for name, value in metadata[2].items())
-
-
-def test_a_scene_that_no_file_holds_runs_as_its_stage_does(tmp_path):
-    scene = scene_from_toml(shipped("scenes", "lab.toml"))
-    scene = replace(scene, name="moved", start=(0.5, 0.25, 0.0), furniture=scene.furniture[:3])
-    file = author_scene(scene, tmp_path / "moved")
-    commands = Commands("there", np.array([[0.0, 0.2, 0.4], [2.0, 0.1, -0.4]]))
-    physical = {"magnetometer": "physical", **SHORT}
-    a, b = (simulate(what, commands, **physical) for what in (scene, file))
-    assert same(a, b)
-    assert a.metadata["scene_sha256"] == b.metadata["scene_sha256"]
-    assert simulate(scene, commands, **physical).metadata == a.metadata
-    many = list(sweep(scene, commands, [0], **physical))
-    assert same(many[0], next(iter(sweep(file, commands, [0], **physical))))
-
-
-def test_every_writer_and_the_lidar_take_the_twin_of_a_scene(lab_scene, tmp_path):
-    scene = read_scene(lab_scene)
-    twin = open_twin(scene)
-    run = simulate(twin, "figure8", lidar="on", **SHORT)
-    assert np.array_equal(scan(scene, run).ranges_m, scan(lab_scene, run).ranges_m)
-    for suffix in (".parquet", ".rrd", ".mcap", ".npz"):
-        write_run(run, tmp_path / f"run{suffix}", twin)
-        assert np.array_equal(read_run(tmp_path / f"run{suffix}")["t"], run["t"])
-    with pytest.raises(InputError, match=r"run\.usda: USD names the scene's file, and this scene has none"):
-        write_run(run, tmp_path / "run.usda", twin)
 
 
 def test_the_stage_of_a_scene_lasts_as_long_as_its_twins(lab_scene):
@@ -103,14 +73,6 @@ def test_points_give_the_run_of_their_csv(twin, tmp_path):
     assert same(simulate_robots(twin, {name: POINTS}, **SHORT)[name], read)
 
 
-@pytest.mark.parametrize("closed", [False, True])
-def test_points_close_as_a_csv_does(closed, tmp_path):
-    points = [*POINTS, POINTS[0]] if closed else POINTS
-    path, read = path_of_points(points), read_path_csv(csv_of(points, tmp_path / "a.csv"))
-    assert path.closed is read.closed is closed
-    assert np.array_equal(path.p_xy, read.p_xy)
-
-
 def test_ways_are_one_for_all_or_one_each(tmp_path):
     file = csv_of(POINTS, tmp_path / "a.csv")
     assert isinstance(drive_inputs(POINTS), Path)
@@ -141,16 +103,3 @@ def test_ways_are_one_for_all_or_one_each(tmp_path):
 def test_what_is_no_path_is_refused(twin, way, said):
     with pytest.raises(InputError, match=said):
         simulate(twin, way, **SHORT)
-
-
-def test_the_gym_takes_a_scene_and_points(lab_scene):
-    gymnasium = pytest.importorskip("gymnasium")
-    import magtwin.gym  # noqa: F401
-
-    options = {"path": POINTS, "magnetometer": "map-only"}
-    envs = [
-        gymnasium.make("magtwin/MagNav-v0", scene=s, **options) for s in (lab_scene, read_scene(lab_scene))
-    ]
-    first, second = (env.reset(seed=1)[0] for env in envs)
-    assert first.size
-    assert np.array_equal(first, second, equal_nan=True)

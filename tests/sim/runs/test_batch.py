@@ -13,7 +13,6 @@ from magtwin.run.run import COLUMNS, Run
 from magtwin.sim.motion import closed_loop
 from magtwin.sim.motion.commands import Commands
 from magtwin.sim.runs import batch
-from magtwin.sim.session import draw_session
 from magtwin.twin import Twin, open_twin
 
 PATHS = ("figure8", "sine", "continuous_cycle", "figure8", "sine", "figure8", "curvilinear")
@@ -59,30 +58,6 @@ def test_runs_are_those_of_simulate_to_the_last_bit_whatever_the_block(neural, a
         assert_same(run, own)
 
 
-def test_a_physical_magnetometers_runs_are_those_of_simulate_too(physical):
-    runs = sweep(physical, PATHS[:3], SEEDS[:3], **SHORT)
-    for run, path, seed in zip(runs, PATHS, SEEDS, strict=False):
-        assert_same(run, simulate(physical, path, seed=seed, **SHORT))
-
-
-def test_the_order_of_the_robots_changes_no_bit(neural, alone):
-    order = [4, 0, 6, 2, 1, 5, 3]
-    paths, seeds, speeds = ([values[i] for i in order] for values in (PATHS, SEEDS, SPEEDS))
-    runs = sweep(neural, paths, seeds, speeds=speeds, block=3, **SHORT)
-    for i, run in zip(order, runs, strict=True):
-        assert_same(run, alone[i])
-
-
-def test_a_run_asked_for_by_its_number_is_the_one_of_the_row(neural, alone):
-    runs = sweep(neural, PATHS, SEEDS, speeds=SPEEDS, block=2, **SHORT)
-    assert_same(runs[-1], alone[-1])
-    assert_same(runs[2], alone[2])
-    for run, i in zip(runs[1:6:2], (1, 3, 5), strict=True):
-        assert_same(run, alone[i])
-    with pytest.raises(IndexError):
-        runs[7]
-
-
 @pytest.fixture(scope="module")
 def others(neural) -> list[Commands | Run | str]:
     """What can be driven beside paths."""
@@ -97,19 +72,6 @@ def test_scripts_drivers_and_recorded_runs_are_those_of_simulate_too(neural, oth
     for k, run in enumerate(runs):
         assert_same(run, simulate(neural, ways[k], seed=k, **SHORT))
     assert len({run["p_world_base"].tobytes() for run in runs}) == 5
-
-
-def test_scripts_and_recorded_runs_end_where_they_end(neural, others):
-    script, _, recorded, _ = others
-    for run, way in zip(sweep(neural, [script, recorded], [1, 1]), (script, recorded), strict=True):
-        assert_same(run, simulate(neural, way, seed=1))
-
-
-def test_one_script_or_recorded_run_serves_all(neural, others):
-    for way in (others[0], others[2]):
-        runs = sweep(neural, way, [1, 2], **SHORT)
-        assert_same(runs[1], simulate(neural, way, seed=2, **SHORT))
-    assert len(sweep(neural, others[0], range(9), **SHORT)._planned) == 1
 
 
 def test_what_cannot_be_driven_is_refused_with_its_number_before_anything_is(neural, others):
@@ -139,18 +101,6 @@ def test_the_compiled_loop_gives_the_bits_of_plain_python(neural, alone, monkeyp
     monkeypatch.setattr(closed_loop.LOOPS, "pays", 0)  # opens it
     for run, own in zip(sweep(neural, PATHS, SEEDS, speeds=SPEEDS, **SHORT), alone, strict=True):
         assert_same(run, own)
-
-
-def test_each_robot_has_its_own_parameters(neural):
-    robots = [draw_session(neural.scene.robot, np.random.default_rng(k)) for k in range(3)]
-    runs = sweep(neural, "figure8", [7, 7, 7], robots=robots, **SHORT)
-    for run, robot in zip(runs, robots, strict=True):
-        own = dataclasses.replace(neural, scene=dataclasses.replace(neural.scene, robot=robot))
-        direct = simulate(own, "figure8", seed=7, session="survey", **SHORT)
-        metadata = {name: fact for name, fact in direct.metadata.items() if name != "session"}
-        assert_same(run, Run(direct.columns, metadata))
-    assert len({run["battery_fraction"][0] for run in runs}) == 3
-    assert len(runs._planned) == 1  # they differ in their sessions alone
 
 
 @pytest.mark.parametrize(
@@ -183,18 +133,6 @@ def test_no_more_than_two_blocks_are_made_ahead(neural, monkeypatch):
     runs.close()
 
 
-def test_what_differs_from_run_to_run_may_come_from_any_iterable(physical):
-    options = {"speeds": np.array([0.1, 0.2], np.float32), **SHORT}
-    runs = sweep(physical, (name for name in ("figure8", "sine")), iter((3, 4)), **options)
-    assert [(run.metadata["path"], run.metadata["seed"]) for run in runs] == [("figure8", 3), ("sine", 4)]
-
-
-def test_seeds_of_numpy_are_seeds(physical):
-    run = sweep(physical, "figure8", np.arange(5), **SHORT)[4]
-    assert_same(run, simulate(physical, "figure8", seed=4, **SHORT))
-    assert type(run.metadata["seed"]) is int
-
-
 @pytest.mark.parametrize(
     ("change", "text"),
     [
@@ -222,24 +160,3 @@ def test_bad_input_is_refused_before_anything_is_driven(physical, change, text):
     paths, seeds = options.pop("paths"), options.pop("seeds")
     with pytest.raises(InputError, match=text):
         sweep(physical, paths, seeds, **options)
-
-
-def test_a_path_off_the_floor_is_refused_with_the_number_of_its_run(physical, tmp_path):
-    far = tmp_path / "far.csv"
-    far.write_text("0,0\n99,0\n")
-    with pytest.raises(InputError, match=r"run 1 of 2, counted from 0: path far.*leaves the floor"):
-        sweep(physical, ["figure8", str(far)], [0, 1])
-
-
-def test_a_robot_with_another_magnetometer_than_the_twins_is_refused(physical, neural):
-    with pytest.raises(InputError, match="open a twin for each"):
-        sweep(physical, "figure8", [0], robots=neural.scene.robot)
-
-
-def test_plans_beyond_their_limit_are_made_again(physical, monkeypatch):
-    speeds = [0.1, 0.15, 0.2]
-    kept = [run["p_world_base"] for run in sweep(physical, "figure8", 3, speeds=speeds, duration_s=5.0)]
-    monkeypatch.setattr(batch, "PLANNED", 1)
-    runs = sweep(physical, "figure8", 3, speeds=speeds, duration_s=5.0)
-    assert len(runs._planned) == 1
-    assert all(np.array_equal(run["p_world_base"], p) for run, p in zip(runs, kept, strict=True))

@@ -3,19 +3,14 @@
 import importlib
 import os
 import signal
-import subprocess
-import sys
 import traceback
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 import magtwin as mt
 from magtwin.errors import InputError
-from magtwin.files.file import shipped
-from magtwin.io import sweeps, tables
+from magtwin.io import tables
 from magtwin.io.formats import read_run, write_run
 from magtwin.io.outputs import Outputs
 from magtwin.io.tables import parquet_of
@@ -97,22 +92,6 @@ def in_child(work):
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-def test_a_killed_long_run_leaves_what_was_made_of_it(twin, run, tmp_path, long_runs):
-    outputs = Outputs.of([tmp_path / "a.mcap", tmp_path / "b.csv"])
-
-    def work():
-        with outputs.kept() as keep, outputs.aside():
-            for number, block in enumerate(blocks(run)):
-                if number == 3:
-                    os.kill(os.getpid(), signal.SIGKILL)
-                keep(block)
-
-    assert in_child(work) == -signal.SIGKILL
-    assert content(read_run(tmp_path / "a.mcap.parts")) == content(run.take(slice(3 * 384)))
-    with pytest.raises(InputError, match="did not end"), outputs.kept() as keep:
-        keep(run)
-
-
 @pytest.mark.parametrize(("suffix", "writer"), [(".mcap", "bags.writer"), (".csv", "tables")])
 def test_a_run_that_is_killed_while_it_is_written_is_whole_in_its_parts(
     run, tmp_path, monkeypatch, long_runs, suffix, writer
@@ -150,67 +129,6 @@ def test_parquet_of_a_long_run_is_read_in_blocks(run, tmp_path, monkeypatch, lon
     assert again.spec("head_k") == spec
     assert max(seen) <= 384
     assert sum(seen) == ROWS
-
-
-@pytest.mark.parametrize(
-    ("name", "row", "value", "message"),
-    [
-        ("flag_bump", 1000, 2.0, "'flag_bump', row 1000: a flag is 0 or 1, got 2"),
-        ("b_total_nt", 600, None, "'b_total_nt', row 600: no value"),
-        ("t", 1500, 0.0, r"row 1500 has 0 s after 11\.1"),
-        ("t", 1500, np.nan, "t must be finite, got nan in row 1500"),
-    ],
-)
-def test_faults_in_a_long_table_are_named_by_their_row(run, tmp_path, long_runs, name, row, value, message):
-    columns = {key: run[key].astype(float).tolist() for key in ("t", "b_total_nt", "flag_bump")}
-    columns[name][row] = value
-    pq.write_table(
-        pa.table({key: pa.array(values, pa.float64()) for key, values in columns.items()}),
-        tmp_path / "a.parquet",
-    )
-    with pytest.raises(InputError, match=message):
-        read_run(tmp_path / "a.parquet")
-
-
-def test_workers_of_a_sweep_write_their_long_runs_themselves(twin, tmp_path, long_runs):
-    runs = mt.sweep(twin, ["figure8", "random"], 3, duration_s=8.0, columns=["b_total_nt"])
-    runs.save(tmp_path / "here")
-    files, said = sweeps.make_block(runs, tmp_path, range(3))
-    assert not files
-    sent, _ = sweeps.make_block(runs, None, range(3))
-    assert [name for name, _ in sent] == [f"run_{k:05d}.parquet" for k in range(3)]
-    for name, data in sent:
-        assert (tmp_path / name).read_bytes() == (tmp_path / "here" / name).read_bytes() == data
-    assert said.csv() == (tmp_path / "here" / "runs.csv").read_bytes()
-
-
-@pytest.mark.slow
-def test_later_long_runs_of_a_process_take_no_memory_of_their_own():
-    """Of ten runs of two hours at 1 Hz; in a process that has not made room before."""
-    code = f"""
-import magtwin as mt
-from magtwin.run import mapped
-mapped.LONG = 5000
-def anon_mb():
-    with open("/proc/self/status") as status:
-        return next(int(line.split()[1]) for line in status if line.startswith("RssAnon")) / 1e3
-twin = mt.open_twin({str(shipped("scenes", "lab", "lab.usda"))!r})
-for run in mt.sweep(twin, "figure8", 10, duration_s=7200.0, rate_hz=1.0):
-    print(run.rows, anon_mb())
-"""
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    rows, anon = np.array([line.split() for line in said.splitlines()], float).T
-    assert (rows == 7200).all()
-    assert anon[-1] - anon[3] < 20
-
-
-def test_a_long_run_that_is_written_leaves_no_parts(run, tmp_path, long_runs):
-    outputs = Outputs.of([tmp_path / "a.csv"])
-    with outputs.kept() as keep:
-        for block in blocks(run):
-            keep(block)
-        assert read_run(tmp_path / "a.csv.parts").rows == ROWS
-    assert not list(tmp_path.iterdir())
 
 
 def resident_mb():

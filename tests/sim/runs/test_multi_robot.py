@@ -1,6 +1,5 @@
 """Several robots in one lab: each by numbers of its own, felt by the others, kept from meeting."""
 
-import importlib.util
 import json
 from dataclasses import replace
 
@@ -21,13 +20,11 @@ from magtwin.run import mapped
 from magtwin.run.run import Run
 from magtwin.sim.motion.drive import Motion
 from magtwin.sim.runs.multi_robot import simulate_robots as run_robots
-from magtwin.sim.runs.neighbours import Neighbour, approaches, iron_moments, neighbours_field_nt
-from magtwin.sim.runs.simulate import simulate
+from magtwin.sim.runs.neighbours import Neighbour, iron_moments, neighbours_field_nt
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec
 from magtwin.spec.robot import PlacedRobot, RobotSpec
 from magtwin.spec.scene import Scene
-from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.twin import Twin, scene_from_toml, simulate_robots
 from magtwin.twin import simulate as simulate_one
 
@@ -158,47 +155,6 @@ def test_what_a_robot_drives_past_adds_eddy_currents_by_the_rate_of_its_field():
     assert_allclose((with_eddy - plain)[1:-1], want[1:-1], atol=2e-3 * np.abs(want).max())
 
 
-def test_robots_that_pass_feel_each_other_when_they_are_near_and_not_when_they_are_far(passing):
-    for name, way in (("ann", EAST), ("bob", WEST)):
-        run = passing[name]
-        alone = simulate(SCENE.led_by(name), way, anomaly_map=FLAT, rng=rngs(name)[name], rate_hz=RATE_HZ)
-        assert_array_equal(run["p_world_base"], alone["p_world_base"])
-        assert_array_equal(
-            run["odom_p"], alone["odom_p"]
-        )  # each draws its own numbers, with others or without
-        felt = np.abs(run["b_truth_nt"] - alone["b_truth_nt"])
-        apart = np.hypot(*(passing["ann"]["p_world_base"] - passing["bob"]["p_world_base"])[:, :2].T)
-        assert felt[apart < 0.65].max() > 50
-        assert felt[apart > 3].max() < 5
-        assert_allclose(run["b_total_nt"], run["b_truth_nt"], atol=1e-9)
-        assert_allclose(np.linalg.norm(run["b_vector_nt"], axis=1), run["b_truth_nt"], rtol=1e-12)
-    assert not np.array_equal(passing["ann"]["odom_v"][:100], passing["bob"]["odom_v"][:100])
-
-
-def test_metadata_name_the_nearest_robot_with_time_and_clearance(passing):
-    for name, other in (("ann", "bob"), ("bob", "ann")):
-        metadata = passing[name].metadata
-        assert (metadata["robot"], metadata["nearest_robot"]) == (name, other)
-        assert metadata["nearest_clearance_m"] == pytest.approx(0.6 - 2 * 0.171, abs=1e-3)
-        assert metadata["nearest_t_s"] == pytest.approx(passing[name]["t"][-1] / 2, abs=0.1)  # half way
-
-
-def test_a_network_predicts_without_the_others_whose_iron_comes_to_it():
-    neural = MagnetometerSpec(kind="neural")
-    scene = replace(SCENE, robot=replace(SCENE.robot, magnetometer=neural))
-    run = drive(scene, disturbances_nt={"ann": lambda table: np.full(table.rows, 300.0)}, wanted=["ann"])[
-        "ann"
-    ]
-    exact = drive(wanted=["ann"])["ann"]
-    alone = simulate(SCENE, EAST, anomaly_map=FLAT, rng=rngs("ann")["ann"], rate_hz=RATE_HZ)
-    assert_allclose(run["b_disturbance_nt"] - 300.0, exact["b_truth_nt"] - alone["b_truth_nt"], atol=1e-8)
-
-
-def test_a_magnetometer_of_the_map_alone_reads_no_robots():
-    blind = replace(SCENE, robot=replace(SCENE.robot, magnetometer=MagnetometerSpec(kind="map-only")))
-    assert not drive(blind, wanted=["ann"])["ann"]["b_disturbance_nt"].any()
-
-
 def test_robots_that_would_meet_are_refused_with_time_and_place():
     ways = {"ann": line("east", (-1, 0), (1, 0)), "bob": line("west", (1, 0), (-1, 0)), "cleo": FAR}
     # they touch when each has gone 1 - 0.171 m; at 0.2 m/s, after 0.15 s to get going
@@ -219,29 +175,12 @@ def test_bumps_are_flagged_in_both_while_they_overlap_where_that_is_asked_for():
     assert runs["cleo"].metadata["nearest_clearance_m"] > 0.5
 
 
-def test_who_arrives_stands_where_it_is_and_is_still_met():
-    stands = Motion(EXACT, 0.02, np.full(10, 0.1), np.zeros(10), (0.0, 0.0, 0.0))
-    comes = Motion(EXACT, 0.02, np.full(1000, 0.1), np.zeros(1000), (-1.0, 0.0, 0.0))
-    (near,) = approaches({"a": Neighbour(robot("a"), stands), "b": Neighbour(robot("b"), comes)})
-    assert near.meet_s == pytest.approx((1.02 - 0.342) / 0.1, abs=0.021)
-    assert near.p_meet == pytest.approx((0.02 - 0.171, 0.0), abs=0.003)
-    assert near.clearance_m == pytest.approx(-0.342, abs=0.002)
-
-
-def test_one_robots_run_is_the_same_whichever_runs_are_wanted(passing):
-    one = drive(wanted=["bob"])
-    assert list(one) == ["bob"]
-    for name, values in one["bob"].items():
-        assert_array_equal(values, passing["bob"][name], err_msg=name)
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         ({"ways": {}}, "no robot is to drive"),
         ({"ways": {"anne": EAST}}, "no robot 'anne'; did you mean 'ann'"),
         ({"ways": {"ann": line("out", (0, 0), (9, 0))}}, r"robot 'ann': path out"),
-        ({"wanted": ["cleo"]}, "no robot 'cleo'"),
         ({"meet": "bounce"}, "no way of robots to meet 'bounce'"),
     ],
 )
@@ -293,38 +232,3 @@ def test_run_writes_a_file_for_each_robot_and_robot_the_one_to_the_same_bits(two
     assert again.equal
     assert not again.causes
     assert whole.metadata["nearest_robot"] == report["metadata"]["bob"]["nearest_robot"] == "ann"
-
-
-def test_meet_flag_lets_robots_drive_through_each_other(two, tmp_path, capsys):
-    (tmp_path / "through.csv").write_text("-0.4,0.5\n0.4,0.5\n")
-    options = ["run", str(two), "--robot", "ann", "--path", str(tmp_path / "through.csv"), "--rate-hz", "20"]
-    out = ["--out", str(tmp_path / "r.parquet")]
-    with pytest.raises(SystemExit):
-        main([*options, *out])
-    assert "'ann' and 'bob' would run into each other after" in capsys.readouterr().err
-    assert not (tmp_path / "r.parquet").exists()
-    main([*options, *out, "--meet", "flag"])
-    assert read_parquet(tmp_path / "r.parquet")["flag_bump"].any()
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--path", "sine"], "which of ann, bob is to drive sine? name it with --robot NAME"),
-        (["--robot", "bo"], "no robot 'bo'; did you mean 'bob'"),
-        (["--engine", "newton"], "--engine newton drives one robot by itself"),
-        (["--live"], "--live and --viewer show one robot"),
-    ],
-)
-def test_run_refuses_what_goes_with_one_robot(two, options, said, capsys):
-    if "newton" in options and importlib.util.find_spec("newton") is None:
-        pytest.skip("newton is not installed, which is said first")
-    with pytest.raises(SystemExit):
-        main(["run", str(two), *options])
-    assert said in capsys.readouterr().err
-
-
-def test_run_refuses_several_robots_options_where_there_is_one(lab_scene, capsys):
-    with pytest.raises(SystemExit):
-        main(["run", str(lab_scene), "--meet", "flag"])
-    assert "--meet is for several robots" in capsys.readouterr().err

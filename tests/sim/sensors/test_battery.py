@@ -1,7 +1,5 @@
 """Battery: energy bookkeeping, closed forms of the load, sag, the discharge curve, the linear model."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,7 +11,6 @@ from magtwin.sim.sensors.battery import (
     STEP_S,
     Battery,
     Discharge,
-    current_a,
     open_voltage,
     wheels_energy_j,
 )
@@ -76,29 +73,6 @@ def test_the_load_is_that_of_electronics_lidar_and_motors():
     assert driving - standing == pytest.approx(work, rel=1e-9)
 
 
-def test_a_turn_on_the_spot_costs_the_way_of_both_wheels():
-    spec = BatterySpec()
-    turning = Motion(DRIVE, 0.02, np.zeros(500), np.full(500, 1.0))
-    times = np.arange(0.0, 10.0, 0.05)
-    rim = 1.0 * DRIVE.wheel_separation_m / 2
-    energy = wheels_energy_j(spec, DRIVE, turning.at(times))
-    assert_allclose(energy, spec.drag_n * rim * 0.05 / spec.motor_efficiency, rtol=1e-9)
-
-
-def test_without_load_nothing_is_lost_and_nothing_sags():
-    pack = discharged(BatterySpec(load_w=0.0, initial_fraction=0.6))
-    assert_array_equal(pack.fraction, 0.6)
-    assert_array_equal(pack.current_a, 0.0)
-    assert_allclose(pack.voltage_v, open_voltage(BatterySpec(), 0.6))
-
-
-def test_a_pack_without_resistance_falls_by_load_over_capacity_an_hour():
-    spec = BatterySpec(capacity_wh=26.0, load_w=13.0, initial_fraction=0.75, resistance_ohm=0.0)
-    pack = discharged(spec, seconds=3600.0)
-    assert pack.fraction[round(3600 / STEP_S) - 1] == pytest.approx(0.25, abs=1e-12)
-    assert np.all(np.diff(pack.fraction) < 0)
-
-
 @pytest.mark.parametrize("model", ["power", "linear"])
 def test_charge_is_never_below_0_and_an_empty_pack_stays_empty(model):
     spec = BatterySpec(model=model, capacity_wh=0.1, initial_fraction=0.5)
@@ -107,30 +81,6 @@ def test_charge_is_never_below_0_and_an_empty_pack_stays_empty(model):
     assert_array_equal(pack.fraction[round(30 / STEP_S) :], 0)
     assert np.isfinite(pack.voltage_v).all()
     assert np.isfinite(pack.current_a).all()
-
-
-def test_the_current_is_the_smaller_root_of_power_through_a_resistance():
-    spec = BatterySpec(resistance_ohm=0.2)
-    u = float(open_voltage(spec, 0.5))
-    power = np.array([0.0, 5.0, 50.0])
-    root = (u - np.sqrt(u * u - 4 * 0.2 * power)) / (2 * 0.2)
-    assert_allclose(current_a(spec, power, np.full(3, 0.5)), root, rtol=1e-12)
-    spec = dataclasses.replace(spec, resistance_ohm=0.0)
-    assert_allclose(current_a(spec, power, np.full(3, 0.5)), power / u)
-
-
-def test_no_more_is_drawn_than_an_empty_pack_can_give():
-    spec = BatterySpec(resistance_ohm=10.0, load_w=15.0)
-    pack = discharged(spec, seconds=10.0)
-    most = spec.voltage_empty_v**2 / 40
-    assert most < 15
-    assert_allclose(pack.power_w, most)
-    assert_allclose(pack.voltage_v * pack.current_a, most)
-
-
-def test_the_discharge_curve_goes_through_its_points_and_from_empty_to_full():
-    spec = BatterySpec(discharge=(0.0, 0.7, 1.0), voltage_empty_v=10.0, voltage_full_v=20.0)
-    assert_allclose(open_voltage(spec, [0.0, 0.25, 0.5, 0.75, 1.0]), [10, 13.5, 17, 18.5, 20])
 
 
 def test_the_linear_model_is_the_papers():
@@ -153,10 +103,3 @@ def test_voltage_has_gaussian_noise_and_charge_and_current_have_none():
     noise = read["battery_v"] - pack.voltage_v[ended]
     assert noise.std() == pytest.approx(0.05, rel=0.03)
     assert noise.mean() == pytest.approx(0.0, abs=4 * 0.05 / np.sqrt(len(t)))
-
-
-def test_it_begins_at_rest_with_its_charge():
-    spec = BatterySpec(initial_fraction=0.7, voltage_noise_std_v=0.0)
-    read = battery_of(spec, on=True).sense(ramp(0.3), np.array([0.0, 0.049]))
-    assert_array_equal(read["battery_fraction"], 0.7)
-    assert_allclose(read["battery_v"] * read["battery_a"], spec.load_w + spec.lidar_w)

@@ -1,16 +1,11 @@
 """Model error: readings are off a network's predictions by what the network says, session by session."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_network import a_net
 
-import magtwin
 from magtwin import simulate, sweep
-from magtwin.errors import MismatchWarning
-from magtwin.io.provenance import repeat
 from magtwin.run.run import COLUMNS
 from magtwin.sim.sensors.model_error import ModelError
 from magtwin.twin import Twin, in_session, open_twin
@@ -47,17 +42,6 @@ def test_the_variance_is_that_of_the_prediction_whatever_that_is():
     )
     assert_allclose(errors.std(axis=0), sd, rtol=0.02)  # 20,000 draws tell it to 0.5 %
     assert_allclose(errors.mean(axis=0), 0, atol=0.03 * sd.max())
-
-
-def test_the_offset_is_a_constant_where_the_prediction_is_less_sure_than_it():
-    error = ModelError(OFFSET, TIME_S, offset=-1.5).error_nt([80.0, 200.0, 5000.0, 40.0], np.zeros(4))
-    assert_allclose(error, [-120.0, -120.0, -120.0, -60.0])
-
-
-def test_where_no_standard_deviation_is_known_there_is_no_error():
-    assert_array_equal(
-        ModelError(OFFSET, TIME_S, offset=1.0).error_nt([np.nan, 80.0], [3.0, 0.0]), [0.0, 80.0]
-    )
 
 
 @pytest.mark.parametrize("rate_hz", [5.0, 20.0, 135.0])
@@ -115,39 +99,6 @@ def test_a_session_has_one_offset_and_another_session_another(lab_scene, tmp_pat
     assert abs(a - b) > 1e-3 * SD
 
 
-def test_sessions_that_are_drawn_from_the_seed_have_offsets_of_the_right_size(lab_scene, tmp_path):
-    made = offsets(lab_scene, tmp_path, lambda twin: list(sweep(twin, "sine", range(100), **SHORT)))
-    assert np.std(made) == pytest.approx(SD, rel=0.2)  # 7 %
-    assert len(set(made)) == 100
-
-
-def test_a_physical_magnetometer_has_no_model_error(lab_scene):
-    run = simulate(lab_scene, "sine", magnetometer="physical", **SHORT)
-    assert_array_equal(run["b_model_error_nt"], 0)
-    assert "model_error" not in run.metadata
-
-
-@pytest.mark.parametrize("options", [{"residual_sd_nt": SD}, {"metadata": FACTS}])
-def test_weights_that_do_not_say_how_their_error_varies_draw_none_and_warn(lab_scene, tmp_path, options):
-    with pytest.warns(MismatchWarning, match="has no statistics of its error"):
-        twin = open_twin(lab_scene, network=weights(tmp_path, **options))
-    run = simulate(twin, "sine", **SHORT)
-    assert_array_equal(run["b_model_error_nt"], 0)
-    assert run.metadata["model_error"] is False
-
-
-def test_figures_that_cannot_be_are_refused(lab_scene, tmp_path):
-    net = weights(tmp_path, residual_sd_nt=SD, metadata=FACTS | {"residual_time_s": -1.0})
-    with pytest.raises(magtwin.InputError, match="residual_time_s"):
-        open_twin(lab_scene, network=net)
-
-
-@pytest.mark.parametrize("model_error", [True, False])
-def test_a_run_is_made_once_more_to_the_bit(twin, model_error):
-    run = simulate(twin, "figure8", seed=8, model_error=model_error, **SHORT)
-    assert repeat(run).equal
-
-
 def test_a_vector_of_robots_has_an_error_and_draws_the_rest_as_without(twin):
     gym = pytest.importorskip("magtwin.gym", reason="needs the extra gym")
     seen = {}
@@ -168,10 +119,3 @@ def test_a_vector_of_robots_has_an_error_and_draws_the_rest_as_without(twin):
         assert a["b_model_error_nt"].std() == pytest.approx(SD, rel=0.15)
     first, last = seen[True][0]["b_model_error_nt"], seen[True][-1]["b_model_error_nt"]
     assert np.corrcoef(first, last)[0, 1] > 0.85  # 0.2 s of 2 s, and the offset
-
-
-def test_the_shipped_network_says_how_its_error_varies(lab_scene):
-    found = open_twin(lab_scene)
-    assert 0 < found.model_error.offset_sd_nt < 300
-    assert 0 < found.model_error.time_s < 60
-    assert dataclasses.replace(found.model_error, offset=1.0).offset == 1.0
