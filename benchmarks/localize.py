@@ -27,9 +27,9 @@ from plain_particles import PlainFilter
 
 from magtwin import compiled
 from magtwin.field.maps.lookup import LOOPS
-from magtwin.io.surveys.maps import open_map
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import Problem, Reading, SensorModel
+from magtwin.twin.maps import open_map
 
 PARTICLES = 100_000
 READINGS = 12

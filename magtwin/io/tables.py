@@ -13,7 +13,7 @@ import struct
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from tokenize import TokenError
 from typing import IO, Any
@@ -38,11 +38,10 @@ from magtwin.run.arrow import (
     spec_said,
     table_of,
 )
-from magtwin.run.parquet import check_parquet
 from magtwin.run.run import COLUMNS, Run, check_clock
 from magtwin.run.spool import Spool, blocks
+from magtwin.tables.parquet import load_parquet
 
-_MAGIC = b"PAR1"
 _ABOUT = "magtwin"
 """Name of the member of an npz with the metadata, and first word of a CSV."""
 
@@ -158,38 +157,6 @@ def _read_long(path: Path, files: Sequence[Path], columns: Mapping[str, str] | N
     run = spool.run
     check_clock(run, str(path))
     return run
-
-
-def _whole(path: Path) -> pa.Table:
-    with pq.ParquetFile(path) as file:  # `read_table` would import pandas
-        return file.read()
-
-
-def load_parquet(path: Path, load: Callable[[Path], Any] = _whole) -> Any:
-    """A Parquet file, loaded by a function of pyarrow.
-
-    Raises:
-        InputError: It is no regular file, does not begin and end like Parquet, or is damaged.
-    """
-    path = existing(path, "Parquet file")
-    _check_file(path, "a Parquet file")
-    with open(path, "rb") as file:
-        head = file.read(4)
-        file.seek(max(0, path.stat().st_size - 4))
-        tail = file.read(4)
-    if head != _MAGIC:
-        raise InputError(f"{path}: not a Parquet file: it begins with {head!r}, not {_MAGIC!r}")
-    if tail != _MAGIC:
-        raise InputError(f"{path}: Parquet cut short: its end is missing; write it again, or copy it again")
-    try:
-        check_parquet(path)
-        loaded = load(path)
-        if isinstance(loaded, pa.Table):
-            loaded.validate(full=True)  # texts that are not UTF-8 fail later otherwise
-        return loaded
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        reason = (str(error).splitlines() or [""])[0]
-        raise InputError(f"{path}: damaged Parquet ({reason}); write it again") from error
 
 
 def _check_file(path: Path, kind: str) -> None:

@@ -18,7 +18,6 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.files.file import existing, read_text, sha256
 from magtwin.files.outputs import check_free, output, transaction
 from magtwin.io.formats import read_run
-from magtwin.io.surveys.maps import map_file, open_map
 from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import MANIFEST, Dataset, open_dataset
 from magtwin.learn.data.dataset import build_dataset as build
@@ -46,6 +45,7 @@ from magtwin.learn.training.model_card import widened_card
 from magtwin.run.run import Run
 from magtwin.spec.scene import Scene
 from magtwin.twin import Twin, check_scene, in_session_of, open_twin, scene_file
+from magtwin.twin.maps import map_file, open_map
 from magtwin.usd.scene import read_scene
 
 File = str | os.PathLike[str]

@@ -20,7 +20,6 @@ from magtwin.files.file import existing, sha256
 from magtwin.files.outputs import output
 from magtwin.frames import wrap_angle, yaw_from_quat
 from magtwin.io.formats import read_run
-from magtwin.io.surveys.maps import map_file, open_map
 from magtwin.localization.bounds import Bounds, bounds
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.odometry import Odometry
@@ -42,6 +41,7 @@ from magtwin.run.run import Run, numbers_in
 from magtwin.run.thinning import field_known, newest
 from magtwin.tasks.own_field import with_own_field
 from magtwin.twin import Twin
+from magtwin.twin.maps import map_file, open_map
 
 RATE_HZ = 5.0
 """Default rate of readings that a localizer gets [Hz]."""

@@ -12,8 +12,8 @@ from magtwin.bench.suite import Scenario
 from magtwin.bench.twin_case import fogm, twin_case
 from magtwin.errors import InputError
 from magtwin.files.file import shipped
-from magtwin.io.surveys.maps import open_map
 from magtwin.localization.problem import OdometryModel, SensorModel
+from magtwin.twin.maps import open_map
 
 LAB = str(shipped("scenes", "lab", "lab.usda"))
 PLAIN = Scenario(name="plain", duration_s=20.0)

@@ -8,9 +8,9 @@ from magtwin.errors import InputError
 from magtwin.figures.views import film, report_runs
 from magtwin.io.convert import convert_run
 from magtwin.io.provenance import repeat_of
-from magtwin.io.surveys.maps import map_file, open_map
 from magtwin.tasks.learning import build_dataset, map_of_scene
 from magtwin.twin import open_twin, scene_of, simulate
+from magtwin.twin.maps import map_file, open_map
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ from magtwin.export.glb import corner_normals
 from magtwin.export.package import PLUGIN, README, export_scene, licence_of
 from magtwin.export.usdz import ALIGNMENT, ALLOWED
 from magtwin.export.validation.validate import validate
-from magtwin.field.survey.folder import read_survey
+from magtwin.field.survey.nodes import read_survey
 from magtwin.files.file import sha256, shipped
 from magtwin.run.run import Run
 from magtwin.usd.animation import read_animation

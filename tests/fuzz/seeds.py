@@ -437,7 +437,7 @@ def _table(file: Path) -> None:
 
 def _survey(file: Path) -> None:
     folder = file.parent / "survey"
-    call("field.survey.folder:write_survey", _map(), folder)
+    call("field.survey.nodes:write_survey", _map(), folder)
     for path in folder.iterdir():
         shutil.move(path, file.parent / path.name)
     folder.rmdir()
@@ -798,7 +798,7 @@ FORMATS: Mapping[str, Format] = {
         text('model = "paper"\nlayers = [8, 4]\nepochs = 3\nlr = 0.001\n'),
         _reads("learn.training.config:read_config"),
     ),
-    "survey": Format("0_map.csv", _survey, _reads("field.survey.folder:read_survey", folder=True)),
+    "survey": Format("0_map.csv", _survey, _reads("field.survey.nodes:read_survey", folder=True)),
     "table": Format("x.csv", _table, _READINGS),
     "readings": Format("x.parquet", _readings, _READINGS),
     "scans": Format("x.parquet", _scans, _reads("io.scans:read_scans")),

@@ -15,9 +15,10 @@ from test_stuck import gridded
 from magtwin.author.earth import earth_of
 from magtwin.cli import main
 from magtwin.field.sources.earth import earth_field_nt
-from magtwin.field.survey.folder import node_map
-from magtwin.io.surveys.maps import _contradictions, _masked, open_map
-from magtwin.io.surveys.readings import load_readings, save_readings
+from magtwin.field.survey.nodes import node_map
+from magtwin.field.survey.saved import load_readings, save_readings
+from magtwin.io.surveys.maps import _masked
+from magtwin.twin.maps import open_map
 from magtwin.usd.maps.layer import load_map
 from magtwin.usd.scene import read_scene
 
@@ -327,7 +328,7 @@ def test_vectors_and_headings_that_contradict_each_other_are_a_doubt(tmp_path, c
     run("map", "import", tmp_path / "hall.csv", "--out", tmp_path / "a.parquet", "--json")
     (doubt,) = json.loads(capsys.readouterr().out)["metadata"]["doubts"]
     assert doubt.startswith("vectors keep no direction in world axes (")
-    (fitted,) = _contradictions(load_readings(tmp_path / "a.parquet"))
+    (fitted,) = vector_doubts(load_readings(tmp_path / "a.parquet"))
     assert fitted == doubt
 
 

@@ -10,10 +10,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from magtwin.errors import InputError
 from magtwin.field.grid import Grid
 from magtwin.field.survey.readings import SHAPES, Readings
+from magtwin.field.survey.saved import load_readings, save_readings
 from magtwin.files.file import sha256
 from magtwin.frames import quat_from_rpy, quat_from_yaw, quat_multiply
 from magtwin.io.surveys.columns import Columns
-from magtwin.io.surveys.readings import load_readings, read_readings, readings_of_run, save_readings
+from magtwin.io.surveys.readings import read_readings, readings_of_run
 from magtwin.run.run import Run
 
 ROWS = "x,y,heading,field\n0,0,0.5,41000\n1,0,1.5,41500\n0,1,-3,40500\n"

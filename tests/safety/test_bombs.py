@@ -419,9 +419,9 @@ def _read_path(path):
 
 
 def _read_readings(path):
-    from magtwin.io.surveys.table import read_csv
+    from magtwin.tables.table import read_table
 
-    return read_csv(path)
+    return read_table(path)
 
 
 def _read_recording(path):

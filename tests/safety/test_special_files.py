@@ -119,7 +119,8 @@ def test_a_stage_that_names_a_pipe_as_a_layer_is_refused(tmp_path):
 
 
 def test_a_part_of_a_run_that_is_a_pipe_is_refused(tmp_path):
-    from magtwin.io.tables import load_parquet, read_parquet
+    from magtwin.io.tables import read_parquet
+    from magtwin.tables.parquet import load_parquet
 
     os.mkfifo(tmp_path / "part-000000.parquet")
     for read, path in ((read_parquet, tmp_path), (load_parquet, tmp_path / "part-000000.parquet")):

@@ -155,7 +155,7 @@ def test_headings_come_back_to_the_last_bit_or_the_one_before(tmp_path):
 
 
 def test_the_real_survey_survives_its_layer_to_half_a_step_of_single_precision(tmp_path, real_data):
-    from magtwin.field.survey.folder import read_survey
+    from magtwin.field.survey.nodes import read_survey
 
     field = read_survey(real_data / "aprilab" / "maps", name="aprilab", licence="MIT")[0]
     back = save_and_load(field, tmp_path)

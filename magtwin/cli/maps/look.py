@@ -35,7 +35,7 @@ def map_plot(
     """
     from magtwin.figures.canvas import save
     from magtwin.figures.maps import draw_map
-    from magtwin.io.surveys.maps import open_map
+    from magtwin.twin.maps import open_map
 
     check_output(out, PICTURES, "a picture", force=force)
     angles = None if headings_deg is None else headings_rad(headings_deg)
@@ -48,7 +48,7 @@ def map_plot(
 def map_info(file: MapFile) -> Done:
     """Print a map's metadata: field, uncertainty, method, sources, licence, frame, height and date."""
     from magtwin.field.maps.statistics import map_metadata
-    from magtwin.io.surveys.maps import open_map
+    from magtwin.twin.maps import open_map
 
     return Done(map_metadata(open_map(file)))
 
@@ -67,7 +67,7 @@ def map_diff(before: Path, after: Path, *, out: Path | None = None, force: Force
         Picture to write (.png or .svg).
     """
     from magtwin.field.maps.difference import difference
-    from magtwin.io.surveys.maps import open_map
+    from magtwin.twin.maps import open_map
 
     check_output(out, PICTURES, "a picture", force=force)
     step("Comparing the maps")
@@ -100,7 +100,7 @@ def map_upward(
     """
     from magtwin.field.maps.continuation import at_height
     from magtwin.field.maps.statistics import map_metadata
-    from magtwin.io.surveys.maps import open_map
+    from magtwin.twin.maps import open_map
     from magtwin.usd.maps.layer import save_map
 
     check_output(out, LAYERS, "a map layer", force=force)
@@ -122,8 +122,8 @@ def map_export(file: MapFile, *, out: Path, force: Force = False) -> Done:
     out
         Folder to make: 0_map.csv, 90_map.csv, ..., rows of x [m], y [m], heading [rad], field [nT].
     """
-    from magtwin.field.survey.folder import write_survey
-    from magtwin.io.surveys.maps import open_map
+    from magtwin.field.survey.nodes import write_survey
+    from magtwin.twin.maps import open_map
 
     return Done(wrote=tuple(write_survey(open_map(file), out, force=force)))
 

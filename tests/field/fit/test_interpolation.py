@@ -76,7 +76,7 @@ def test_cubic_reproduces_a_bicubic_field_between_nodes():
 
 
 def test_trilinear_agrees_with_the_maps_own_lookup():
-    from magtwin.field.survey.folder import node_map
+    from magtwin.field.survey.nodes import node_map
 
     readings = grid_survey(lambda x, y, yaw: cubic(x, y, yaw) + 300 * np.cos(yaw))
     p, yaw = points()

@@ -112,7 +112,8 @@ def test_nodes_without_a_reading_have_the_mean_and_spoil_no_other():
 
 
 def test_the_real_survey_stood_within_a_centimetre(real_data):
-    from magtwin.field.survey.folder import node_map, read_grid
+    from magtwin.field.survey.folder import read_grid
+    from magtwin.field.survey.nodes import node_map
     from magtwin.field.survey.stuck import mask_stuck
 
     readings, _ = mask_stuck(read_grid(real_data / "aprilab" / "maps"))

@@ -7,7 +7,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
 from magtwin.field.survey import folder as survey
-from magtwin.field.survey.folder import node_map, read_grid, read_survey
+from magtwin.field.survey.folder import read_grid
+from magtwin.field.survey.nodes import node_map, read_survey
 from magtwin.field.survey.readings import Readings, taken_of
 from magtwin.files.file import sha256
 

@@ -1,27 +1,33 @@
-"""Table: columns of numbers from CSV or Parquet, with file and line of every cell for error messages."""
+"""Table: columns of numbers from CSV or Parquet, with file and line of every cell for error messages.
+
+The one reader of tables that other programs wrote: of surveys, paths and commands.
+"""
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, hint
 from magtwin.files.file import existing
-from magtwin.io.surveys.columns import TIME_UNITS, named
-from magtwin.io.tables import load_parquet
-from magtwin.tables.delimited import MISSING, QUOTED, bare, number_of, read_delimited
+from magtwin.report.summary import listed
+from magtwin.tables.delimited import MISSING, QUOTED, number_of, read_delimited
+from magtwin.tables.labels import bare, meaning_of, unit_of
+from magtwin.tables.quantities import QUANTITIES
 
 Array = NDArray[np.float64]
 
-_TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
-"""Ticks per second of a timestamp of Arrow, by its unit."""
+PARQUET = (".parquet", ".pq")
+"""Suffixes of Parquet; other tables are text."""
+
+_EPOCHS = ((1e17, 1e9, "ns"), (1e14, 1e6, "us"), (1e11, 1e3, "ms"))
+"""Least median of times since 1970, ticks per second and unit; below them are seconds."""
 
 _ISO = re.compile(r"\d{4}-\d\d-\d\d", re.ASCII)
 _DATE = re.compile(
@@ -67,6 +73,9 @@ class Table:
     notes: tuple[str, ...] = ()
     """What was repaired."""
 
+    comments: tuple[tuple[int, str], ...] = ()
+    """Number and text of the lines of a text that begin with `#`."""
+
     @property
     def rows(self) -> int:
         """Number of rows."""
@@ -103,13 +112,57 @@ class Table:
         known = hint(name, names) if names else f"no header: name columns by number, 1 to {len(self.columns)}"
         raise InputError(f"{self.path}: no column {name!r}; {known}")
 
-    def numbers(self, name: str) -> Array:
-        """The numbers of a column, shape (N,); nan for cells that are empty or nan.
+    def find(self, *symbols: str, apart: Collection[str] = ()) -> list[str]:
+        """The columns that hold quantities that belong together, by their names; [] if one has none.
+
+        Args:
+            symbols: Quantities in `magtwin.tables.quantities.QUANTITIES`, such as x and y.
+            apart: Columns that hold something else.
 
         Raises:
-            InputError: There is no such column, or a cell is not a number; with file and line.
+            InputError: Two columns could be one of them.
+        """
+        labels = [column.name for column in self.columns if column.name not in ("", *apart)]
+        matches = {
+            symbol: {label: meaning for label in labels if (meaning := meaning_of(label, symbol))}
+            for symbol in symbols
+        }
+        names = [{meaning.name for meaning in some.values()} for some in matches.values()]
+        if not (common := set.intersection(*names)):
+            return []
+        found = []
+        for symbol, some in matches.items():
+            named = {label: m for label, m in some.items() if m.name == min(common)}
+            least = min(meaning.around for meaning in named.values())
+            best = [label for label, meaning in named.items() if meaning.around == least]
+            if len(best) > 1:
+                raise InputError(f"{self.path}: {listed(best)} could each be {symbol}; keep one")
+            found += best
+        return found
+
+    def unit(self, name: str, symbol: str) -> str:
+        """The unit in the label of a column that holds a quantity; "" if there is none."""
+        return unit_of(self.column(name).name, symbol)
+
+    def numbers(self, name: str, symbol: str = "") -> Array:
+        """The numbers of a column, shape (N,); nan for cells that are empty or nan.
+
+        Args:
+            name: The column, as for `column`.
+            symbol: Its quantity. Its values are then taken from the unit in the label to SI units or nT.
+
+        Raises:
+            InputError: There is no such column, it is in no unit of the quantity, or a cell is not a number;
+                with file and line.
         """
         column = self.column(name)
+        factor = 1.0
+        if symbol and (unit := self.unit(name, symbol)):
+            units = QUANTITIES[symbol].units
+            if unit not in units:
+                label = column.name[:QUOTED]
+                raise InputError(f"{self.path}: {label!r} is in no unit of {symbol}; {hint(unit, units)}")
+            factor = units[unit]
         if isinstance(column.cells, np.ndarray):
             if column.cells.dtype.kind not in "fiub":
                 raise InputError(f"{column.path}: column {name!r} must hold numbers, got texts")
@@ -124,7 +177,26 @@ class Table:
             mark = "; a decimal comma is read where no number has a point, and no comma separates cells"
             advice = mark if "," in str(shown) else ""
             raise InputError(f"{column.where(row)}: {name} must be a finite number, got {shown}{advice}")
-        return values
+        return factor * values
+
+    def taken(self, columns: Mapping[str, str]) -> list[str]:
+        """What was deduced from the header about the columns of quantities, and what was left out."""
+        notes, labels = list[str](), list(columns.values())
+        wanted = listed(list(columns))
+        meanings = {symbol: meaning_of(label, symbol) for symbol, label in columns.items()}
+        if any(m is None or (m.name, m.around) != (0, 0) for m in meanings.values()):
+            notes.append(f"{listed(labels)} as {wanted}")
+        elif labels != sorted(labels, key=self.names.index):
+            notes.append(f"{wanted} by their names")
+        if some := [
+            label
+            for symbol, label in columns.items()
+            if QUANTITIES[symbol].units.get(self.unit(label, symbol), 1.0) != 1
+        ]:
+            notes.append(f"{listed(some)} by the units in their names")
+        if left := [column.name for column in self.columns if column.name and column.name not in labels]:
+            notes.append(f"{wanted}, and left out {listed(left)}")
+        return notes
 
     def times(self, name: str) -> Array:
         """The times of a column [s], shape (N,); nan for cells that are empty or nan.
@@ -145,7 +217,7 @@ class Table:
                 if np.isinf(number_of(text)):
                     wanted = f"a number of seconds, or a date and time such as {_READ}"
                     raise InputError(f"{column.where(row)}: {name} must be {wanted}; got {text[:QUOTED]!r}")
-            return self.numbers(name) * TIME_UNITS.get(named(column.name, TIME_UNITS)[1], 1.0)
+            return self.numbers(name, "t" if self.unit(name, "t") in QUANTITIES["t"].units else "")
         is_day_first = _is_day_first(texts)
         seconds = np.full(self.rows, np.nan)
         for row, text in enumerate(texts):
@@ -177,7 +249,22 @@ class Table:
                 f"{other.path}: {other.rows} rows, but {self.path} has {self.rows}; "
                 "files joined side by side need one row per reading each"
             )
-        return Table(self.columns + other.columns, self.notes + other.notes)
+        return Table(self.columns + other.columns, self.notes + other.notes, self.comments)
+
+
+def since_1970(table: Table, name: str) -> tuple[Array, str]:
+    """The times of a column [s], and a note.
+
+    Times without a unit that are far too large for seconds are ms, us or ns since 1970.
+    """
+    t = table.times(name)
+    usual = float(np.median(np.abs(t[np.isfinite(t)]))) if np.isfinite(t).any() else 0.0
+    if table.unit(name, "t") not in QUANTITIES["t"].units:
+        for least, ticks, unit in _EPOCHS:
+            if usual >= least:
+                label = table.column(name).name or name
+                return t / ticks, f"{label} in {unit} since 1970, by its size"
+    return t, ""
 
 
 class _UnclearDateError(ValueError):
@@ -224,35 +311,28 @@ def _moment(text: str, is_day_first: bool | None) -> datetime:
     )
 
 
-def read_csv(path: str | os.PathLike[str]) -> Table:
-    """Read a text file of readings, as `magtwin.tables.delimited` does, with units below the header."""
-    text = read_delimited(path, "file of readings", "readings", "one row of numbers per reading", units=True)
-    names = text.names or ("",) * text.width
-    pairs = zip(names, zip(*text.rows, strict=True), strict=True)
-    return Table(tuple(Column(name, list(cells), text.path, text.lines) for name, cells in pairs), text.notes)
+def read_table(
+    path: str | os.PathLike[str],
+    noun: str = "file of readings",
+    wanted: str = "one row of numbers per reading",
+) -> Table:
+    """Read a table: Parquet by its suffix, else text, as `magtwin.tables.delimited` does.
 
-
-def read_parquet_table(path: str | os.PathLike[str]) -> Table:
-    """Read the columns of numbers, texts and timestamps of a Parquet file; timestamps are seconds since 1970.
+    Args:
+        path: The file.
+        noun: What it is, for error messages.
+        wanted: What a row holds, for error messages.
 
     Raises:
-        InputError: The file is missing, is not Parquet, is truncated, or has no rows.
+        InputError: The file is missing, is neither, is damaged, or has no rows.
     """
-    path = existing(path, "Parquet file")
-    table = load_parquet(path)
-    columns = []
-    for field, values in zip(table.schema, table.columns, strict=True):
-        kind = field.type
-        if pa.types.is_dictionary(kind):
-            values, kind = values.cast(kind.value_type), kind.value_type
-        if pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind):
-            plain = values.cast(pa.float64(), safe=False) if values.null_count else values
-            columns.append(Column(field.name, plain.to_numpy(), path, None))
-        elif pa.types.is_timestamp(kind):
-            since = values.cast(pa.int64()).cast(pa.float64(), safe=False)
-            columns.append(Column(field.name, since.to_numpy() / _TICKS[kind.unit], path, None))
-        elif pa.types.is_string(kind) or pa.types.is_large_string(kind):
-            columns.append(Column(field.name, np.array(values.to_pylist(), object), path, None))
-    if not columns or not table.num_rows:
-        raise InputError(f"{path}: it has no rows of numbers; expected one per reading")
-    return Table(tuple(columns))
+    if Path(path).suffix.lower() in PARQUET:
+        from magtwin.tables.parquet import parquet_columns  # imports pyarrow
+
+        path = existing(path, noun)
+        return Table(tuple(Column(name, cells, path, None) for name, cells in parquet_columns(path)))
+    text = read_delimited(path, noun, wanted)
+    names = text.names or ("",) * len(text.rows[0])
+    pairs = zip(names, zip(*text.rows, strict=True), strict=True)
+    columns = tuple(Column(name, list(cells), text.path, text.lines) for name, cells in pairs)
+    return Table(columns, text.notes, text.comments)
