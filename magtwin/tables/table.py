@@ -160,8 +160,9 @@ class Table:
         if symbol and (unit := self.unit(name, symbol)):
             units = QUANTITIES[symbol].units
             if unit not in units:
-                label = column.name[:QUOTED]
-                raise InputError(f"{self.path}: {label!r} is in no unit of {symbol}; {hint(unit, units)}")
+                usual = {factor: known.replace("_", "/") for known, factor in reversed(units.items())}
+                text = f"{column.name[:QUOTED]!r} is in no unit of {symbol}"
+                raise InputError(f"{self.path}: {text}; {hint(unit, usual.values())}")
             factor = units[unit]
         if isinstance(column.cells, np.ndarray):
             if column.cells.dtype.kind not in "fiub":
@@ -182,10 +183,10 @@ class Table:
     def taken(self, columns: Mapping[str, str]) -> list[str]:
         """What was deduced from the header about the columns of quantities, and what was left out."""
         notes, labels = list[str](), list(columns.values())
-        wanted = listed(list(columns))
+        wanted = _and(list(columns))
         meanings = {symbol: meaning_of(label, symbol) for symbol, label in columns.items()}
         if any(m is None or (m.name, m.around) != (0, 0) for m in meanings.values()):
-            notes.append(f"{listed(labels)} as {wanted}")
+            notes.append(f"{_and(labels)} as {wanted}")
         elif labels != sorted(labels, key=self.names.index):
             notes.append(f"{wanted} by their names")
         if some := [
@@ -193,7 +194,7 @@ class Table:
             for symbol, label in columns.items()
             if QUANTITIES[symbol].units.get(self.unit(label, symbol), 1.0) != 1
         ]:
-            notes.append(f"{listed(some)} by the units in their names")
+            notes.append(f"{_and(some)} by the units in their names")
         if left := [column.name for column in self.columns if column.name and column.name not in labels]:
             notes.append(f"{wanted}, and left out {listed(left)}")
         return notes
@@ -265,6 +266,11 @@ def since_1970(table: Table, name: str) -> tuple[Array, str]:
                 label = table.column(name).name or name
                 return t / ticks, f"{label} in {unit} since 1970, by its size"
     return t, ""
+
+
+def _and(names: Sequence[str]) -> str:
+    """Names in a line: `t, v and w`."""
+    return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)[: 3 * QUOTED]
 
 
 class _UnclearDateError(ValueError):

@@ -44,7 +44,8 @@ ABOUT, READING = About(), Reading()
 _TOLD = {f.name: f"--{f.name.replace('_', '-')}" for f in (*fields(Reading), *fields(Columns))}
 """Flags of `map import` that tell how to read a survey."""
 
-_ADVICE = re.compile(rf"({'|'.join(sorted(set(_TOLD.values()), key=len, reverse=True))}) ([^\s,;()]+)")
+_FLAGS = "|".join(sorted(set(_TOLD.values()), key=len, reverse=True))
+_ADVICE = re.compile(rf"(?:(?:{_FLAGS}) [^\s,;()]+ ?)+")
 
 
 @contextmanager
@@ -57,8 +58,9 @@ def _as_imported(sources: Sequence[Path]) -> Iterator[None]:
         advice = _ADVICE.search(text)
         if advice is None:
             raise
+        told = advice.group().split()
         out = Path(sources[0]).with_suffix(".parquet").name
-        words = ["magtwin", "map", "import", *map(str, sources), *advice.groups(), "--out", out]
+        words = ["magtwin", "map", "import", *map(str, sources), *told, "--out", out]
         raise InputError(f"{text}; import it first: {shlex.join(words)}") from error
 
 

@@ -213,7 +213,8 @@ def _read_layer(path: Path, heading_deg: float, unit: str, scale: float | None) 
     for role, column in values.items():
         if len(lost := np.flatnonzero(~np.isfinite(column))):
             text = "every node needs a finite value, measure it or copy the file again"
-            raise InputError(f"{where(int(lost[0]))}: {labels[role][0]} is missing; {text}")
+            why = "".join(f"; {note}" for note in table.notes if "cut short" in note)
+            raise InputError(f"{where(int(lost[0]))}: {labels[role][0]} is missing; {text}{why}")
     field = nt_per(unit, scale) * values["field"]
     if len(low := np.flatnonzero(field <= 0)):
         text = f"scalar_mag is a magnitude, above 0 nT, got {field[low[0]]:g}"

@@ -138,7 +138,7 @@ def _placed(table: Table, told: Columns, taken: list[str]) -> Columns:
     notes = table.taken({"x": columns.x, "y": columns.y})
     taken += [note for note in notes if "by the units" in note]
     if not (told.x or told.y):
-        taken += [f"{note} (--x, --y)" for note in notes if note.endswith(" as x, y")]
+        taken += [f"{note} (--x, --y)" for note in notes if note.endswith(" as x and y")]
     return columns
 
 
