@@ -67,26 +67,6 @@ def written(tmp_path):
     return path
 
 
-def test_a_run_comes_back_from_parquet_to_the_last_bit_in_the_same_order(written):
-    assert_same(some_run(), read_parquet(written))
-
-
-def test_the_same_run_gives_the_same_bytes(written, tmp_path):
-    write_parquet(some_run(), tmp_path / "again.parquet")
-    assert (tmp_path / "again.parquet").read_bytes() == written.read_bytes()
-
-
-def test_another_run_gives_other_bytes(written, tmp_path):
-    write_parquet(some_run().with_metadata(seed=8), tmp_path / "other.parquet")
-    assert (tmp_path / "other.parquet").read_bytes() != written.read_bytes()
-
-
-def test_a_run_of_no_rows_comes_back(tmp_path):
-    run = Run({name: values[:0] for name, values in some_run().items()}, FACTS)
-    write_parquet(run, tmp_path / "none.parquet")
-    assert_same(run, read_parquet(tmp_path / "none.parquet"))
-
-
 @settings(max_examples=25, deadline=None)
 @given(
     width=st.integers(1, 5),
@@ -141,59 +121,40 @@ def test_a_file_rewritten_without_metadata_is_still_a_run(written, tmp_path):
         assert np.array_equal(run[name], values, equal_nan=True), name
 
 
-def test_a_missing_file_is_refused_and_the_near_name_told(written):
-    with pytest.raises(InputError, match=r"runn\.parquet: no such Parquet file; did you mean 'run\.parquet'"):
-        read_parquet(written.with_name("runn.parquet"))
+def table(**columns):
+    return lambda path: pq.write_table(pa.table(columns), path)
 
 
-def test_a_file_of_another_kind_is_refused(tmp_path):
-    (tmp_path / "run.parquet").write_text("t,b_total_nt\n0,41000\n")
-    with pytest.raises(InputError, match=r"run\.parquet: not a Parquet file: it begins with b't,b_'"):
+def changed(change):
+    def write(path):
+        write_parquet(some_run(), path)
+        path.write_bytes(change(path.read_bytes()))
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda path: None, "no such Parquet file"),
+        (lambda path: path.mkdir(), "a folder without Parquet parts"),
+        (changed(lambda content: b""), "not a Parquet file"),
+        (changed(lambda content: b"t,b_total_nt\n0,41000\n"), "not a Parquet file: it begins with"),
+        (changed(lambda content: content[:-100]), "cut short"),
+        (changed(lambda content: content[:4] + bytes(1996) + content[2000:]), "damaged Parquet"),
+        (table(time=[0.0, 1.0], b=[1.0, 2.0]), "column 't' is missing"),
+        (table(t=[0.0], odom_p_x=[1.0]), "column 'odom_p_y' is missing beside 'odom_p_x'"),
+        (table(t=["now", "then"]), "column 't' must hold numbers or flags"),
+        (table(t=[0.0, 1.0], yaw=[0.5, None]), "column 'yaw', row 1: no value"),
+        (table(t=[0.0, 2.0, 1.0]), "row 2 has 1 s after 2 s"),
+        (table(t=[0.0, 1.0], flag_bump=[0.0, 0.5]), r"'flag_bump', row 1: a flag is 0 or 1, got 0\.5"),
+    ],
+)
+def test_parquet_that_holds_no_run_is_refused(tmp_path, make, said):
+    make(tmp_path / "run.parquet")
+    with pytest.raises(InputError, match=said) as refusal:
         read_parquet(tmp_path / "run.parquet")
-
-
-def test_an_empty_file_and_a_folder_are_refused(tmp_path):
-    (tmp_path / "run.parquet").touch()
-    with pytest.raises(InputError, match="not a Parquet file"):
-        read_parquet(tmp_path / "run.parquet")
-    with pytest.raises(InputError, match="a folder without Parquet parts"):
-        read_parquet(tmp_path)
-
-
-def test_a_file_cut_short_is_refused(written):
-    written.write_bytes(written.read_bytes()[:-100])
-    with pytest.raises(InputError, match="Parquet cut short: its end is missing"):
-        read_parquet(written)
-
-
-def test_a_file_damaged_inside_is_refused(written):
-    content = bytearray(written.read_bytes())
-    content[4:2000] = bytes(1996)
-    written.write_bytes(content)
-    with pytest.raises(InputError, match="damaged Parquet"):
-        read_parquet(written)
-
-
-def test_parquet_without_a_clock_is_refused(tmp_path):
-    pq.write_table(pa.table({"time": [0.0, 1.0], "b": [1.0, 2.0]}), tmp_path / "other.parquet")
-    with pytest.raises(InputError, match="not a Run: column 't' is missing"):
-        read_parquet(tmp_path / "other.parquet")
-
-
-def test_parquet_with_a_part_missing_is_refused(written):
-    pq.write_table(pq.read_table(written).drop_columns(["odom_p_y"]), written)
-    with pytest.raises(InputError, match="column 'odom_p_y' is missing beside 'odom_p_x'"):
-        read_parquet(written)
-
-
-def test_parquet_with_text_or_holes_is_refused(tmp_path):
-    path = tmp_path / "run.parquet"
-    pq.write_table(pa.table({"t": ["now", "then"]}), path)
-    with pytest.raises(InputError, match="column 't' must hold numbers or flags, got string"):
-        read_parquet(path)
-    pq.write_table(pa.table({"t": [0.0, 1.0], "yaw": [0.5, None]}), path)
-    with pytest.raises(InputError, match="column 'yaw', row 1: no value; write nan"):
-        read_parquet(path)
+    assert "run.parquet" in str(refusal.value)
 
 
 def test_an_output_that_exists_is_kept_unless_forced(written):
@@ -471,20 +432,6 @@ def test_a_run_of_thousands_of_columns_is_read(write, read, name, tmp_path):
     assert back["c2999"].tolist() == [2999.0, 2999.0]
 
 
-def test_parquet_whose_clock_or_flags_are_wrong_is_refused_with_the_row(tmp_path):
-    path = tmp_path / "run.parquet"
-    pq.write_table(pa.table({"t": [0.0, 2.0, 1.0]}), path)
-    with pytest.raises(InputError, match="row 2 has 1 s after 2 s; sort the rows"):
-        read_parquet(path)
-    pq.write_table(pa.table({"t": [0.0, 1.0], "flag_bump": [0.0, 0.5]}), path)
-    with pytest.raises(InputError, match=r"column 'flag_bump', row 1: a flag is 0 or 1, got 0\.5"):
-        read_parquet(path)
-    twice = pa.Table.from_arrays([pa.array([0.0]), pa.array([1.0]), pa.array([2.0])], ["t", "yaw", "yaw"])
-    pq.write_table(twice, path)
-    with pytest.raises(InputError, match=r"two columns are called 'yaw'|damaged"):
-        read_parquet(path)
-
-
 def test_blocks_become_the_same_bytes_as_the_whole_written_at_once(tables, tmp_path):
     run = some_run()
     with ParquetParts(tmp_path / "run.parquet") as parts:
@@ -539,13 +486,6 @@ def test_a_full_disk_is_refused_and_what_was_there_stays(write, read, name, tmp_
         write(some_run(2000), path, force=True)
     assert path.read_text() == "earlier"
     assert [p.name for p in tmp_path.iterdir()] == [name]
-
-
-@pytest.mark.parametrize(("write", "read", "name"), TABLES, ids=NAMES)
-def test_a_folder_that_cannot_be_written_is_refused(write, read, name, tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="cannot be written"):
-        write(some_run(), tmp_path / "file" / name)
 
 
 @contextmanager

@@ -67,16 +67,6 @@ def test_a_checkerboard_leaves_nodes_out_at_all_headings_and_predicts_each_once(
     assert figures(report)["readings predicted"] == len(readings)
 
 
-def test_readings_that_are_not_good_count_on_neither_side(monkeypatch):
-    readings = survey()
-    good = np.ones(len(readings), bool)
-    good[::7] = False
-    b = np.where(good, readings.b_nt, 1.0)  # absurd where not good
-    found = figures(check(readings.with_(good=good, b_nt=b), ["trilinear", "cubic", "gp"]))
-    assert found["readings predicted"] == good.sum()
-    assert max(found[f"{m} RMSE"] for m in ("trilinear", "cubic", "gp")) < 1000
-
-
 def test_runs_are_left_out_one_at_a_time_and_within_keeps_near_readings():
     readings = drive(count=300)
     run = (readings.p_xy[:, 0] > 0).astype(int)  # two halves of the floor: no reading near the other half's

@@ -54,15 +54,6 @@ def test_a_choice_is_repeated_to_the_last_bit(chosen):
         assert_array_equal(a, b)
 
 
-def test_progress_never_goes_back_and_names_what_is_tried(chosen):
-    _, _, heard = chosen
-    done = [d for d, _, _ in heard]
-    assert done == sorted(done)
-    assert heard[-1][0] == heard[-1][1]
-    assert any(what.startswith("trying gp matern") for *_, what in heard)
-    assert any(what.startswith("fitting ") for *_, what in heard)
-
-
 def test_the_report_has_a_line_for_every_candidate(chosen):
     _, model, _ = chosen
     figures = {f.name: f for f in choice_report(model.parameters).figures}
@@ -85,30 +76,6 @@ def test_few_readings_get_a_harmonic_fit():
     model = fit(readings, "auto")
     assert model.method == "harmonic"
     assert "too few readings" in model.parameters[CHOSEN]
-
-
-def test_a_drive_is_thinned_and_tested_only_near_its_readings():
-    readings = drive(3000)
-    ((rest, test),) = choice._held_out(readings)
-    assert len(rest) <= choice.MOST_FITTED
-    assert 100 < len(test) <= choice.MOST_TESTED
-
-
-def test_one_of_several_runs_is_left_out():
-    readings = drive(900).with_(run=np.repeat([0, 1, 2], 300), runs=("a", "b", "c"))
-    ((rest, test),) = choice._held_out(readings)
-    assert set(test.run) == {1}
-    assert set(rest.run) == {0, 2}
-
-
-def test_every_fifth_node_is_left_out_at_all_its_headings_twice():
-    readings = survey()
-    nodes = [set(map(tuple, test.node[:, 1:])) for _, test in choice._held_out(readings)]
-    assert len(nodes) == 2
-    assert not nodes[0] & nodes[1]
-    for (rest, test), own in zip(choice._held_out(readings), nodes, strict=True):
-        assert len(test) == 4 * len(own)
-        assert not own & set(map(tuple, rest.node[:, 1:]))
 
 
 def test_vectors_are_tried_with_and_without_directions():

@@ -101,19 +101,6 @@ def test_a_survey_of_one_heading_makes_a_map_of_one_layer():
     assert_allclose(field.headings_rad, [0.5])
 
 
-def test_progress_counts_up_to_its_total():
-    said = []
-    readings = survey(rows=4, columns=4)
-    model = fit(readings, "gp", progress=lambda *step: said.append(step))
-    assert said[0][0] == 0
-    assert said[-1][0] == said[-1][1]
-    assert [s[0] for s in said] == sorted(s[0] for s in said)
-    said.clear()
-    raster(model, readings, progress=lambda *step: said.append(step))
-    assert said[-1][0] == said[-1][1]
-    assert said[-1][2] == "headings"
-
-
 def test_an_unknown_method_or_option_is_refused_with_the_near_one():
     readings = survey(rows=4, columns=4)
     with pytest.raises(InputError, match="no method 'cubik'; did you mean 'cubic'"):
@@ -133,13 +120,6 @@ def test_readings_on_one_line_are_refused_by_the_harmonic_fit_too():
     line = Readings(p_xy=np.column_stack([x, 0 * x]), yaw=0 * x, b_nt=41_000 + 500 * np.sin(x), name="line")
     with pytest.raises(InputError, match=r"readings of 'line' lie on one line, x 0\.\.5, y 0\.\.0 m"):
         raster(fit(line, "harmonic"), line)
-
-
-def test_every_method_has_its_own_name():
-    readings = survey(rows=4, columns=4)
-    for method in QUICK:
-        assert fit(readings, method).method == method
-    assert set(QUICK) < set(METHODS)
 
 
 def test_a_map_has_its_surveys_frame_and_datum_and_a_height_only_where_the_survey_has_one():

@@ -10,7 +10,6 @@ from test_gp import survey, truth
 
 from magtwin.field.fit.fit import OFFSET_SD_NT, fit, grid_report, offset_sd_nt, raster
 from magtwin.field.fit.passes import by_pass
-from magtwin.field.maps.difference import difference
 from magtwin.field.maps.map import OFFSET
 from magtwin.field.maps.statistics import map_metadata
 from magtwin.field.survey.readings import Readings
@@ -110,19 +109,6 @@ def test_a_problem_takes_the_offset_of_a_map_once_as_a_bias():
         assert known.belief.offset_sd_nt == 0
     assert_allclose(problem.belief.variance_nt2, field.variance_nt2 - OFFSET_SD_NT**2)
     assert field.relative().relative() == problem.belief
-
-
-def test_changes_between_maps_are_tested_without_their_offsets():
-    field = raster(fitted("gp"), loops(), spacing_m=0.2)
-    found = difference(field, field)
-    assert found.sd_nt[np.isfinite(found.z)].max() < OFFSET_SD_NT
-
-
-@pytest.mark.parametrize("wrong", ["far", -3.0, float("nan"), float("inf"), None, [1.0]])
-def test_an_offset_that_is_none_is_not_used(wrong):
-    field = replace(raster(fitted("gp"), loops(), spacing_m=0.2), parameters={OFFSET: wrong})
-    assert field.offset_sd_nt == 0
-    assert field.relative() is field
 
 
 def test_a_fit_doubts_one_drive_and_one_that_never_comes_back():

@@ -95,28 +95,6 @@ def test_a_harmonic_field_gives_every_height_exactly_and_leads_back():
         assert_array_equal(at_height(there, HEIGHT_M).values_nt, field.values_nt)
 
 
-def test_the_height_that_a_map_has_is_the_map_itself():
-    field = a_map(a_sheet(1.0))
-    assert at_height(field, HEIGHT_M) is field
-
-
-def test_what_is_continued_says_so():
-    sheet = a_sheet(1.0)
-    field = a_map(sheet, parameters={"spacing_m": 0.25})
-    up = at_height(field, 0.5)
-    assert up.method == (
-        "drawn; continued from 0.35 to 0.5 m by the waves of its grid (Blakely 1995, eq. 12.8)"
-    )
-    assert up.height_m == 0.5
-    assert up.parameters["spacing_m"] == 0.25
-    assert up.parameters["continued_from_m"] == HEIGHT_M
-    spread, mean = field.values_nt.std(), field.values_nt.mean()
-    assert up.parameters["second_order_nt"] == pytest.approx(spread**2 / (2 * mean), abs=1e-3)
-    exact = at_height(replace(field, harmonic=sheet), 0.5)
-    assert exact.method == "drawn; continued from 0.35 to 0.5 m by its harmonic field"
-    assert "second_order_nt" not in exact.parameters
-
-
 def test_the_error_left_at_the_border_and_beside_masked_nodes_is_within_three_deviations():
     sheet = a_sheet(3.0)
     plain = a_map(sheet)

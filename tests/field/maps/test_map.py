@@ -74,17 +74,6 @@ def test_turning_the_layers_turns_the_lookup(x, y, yaw, turns, quarter):
     assert_allclose(got, want, rtol=0, atol=1e-8)  # 100 rad carries 1e-14 rad of rounding, times 1e4 nT/rad
 
 
-def test_shapes_are_broadcast_and_kept():
-    field = field_map()
-    assert field.lookup((0.0, 0.0), 0.0).shape == ()
-    assert field.lookup(np.zeros((2, 3, 2)), 0.0).shape == (2, 3)
-    assert field.lookup((0.0, 0.0), np.zeros((5, 1))).shape == (5, 1)
-    assert field.lookup(np.zeros((4, 1, 2)), np.zeros(7)).shape == (4, 7)
-    assert field.lookup(np.zeros((0, 2)), 0.0).shape == (0,)
-    with pytest.raises(InputError, match=r"shape \(\.\.\., 2\), got \(3,\)"):
-        field.lookup((0, 0, 0), 0.0)
-
-
 def test_outside_the_map_gives_nan_the_border_or_a_refusal():
     field = field_map(name="lab")
     p = np.array([[3.2, 0.0], [0.0, -9.0], [1.0, 1.0]])

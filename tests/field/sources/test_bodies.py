@@ -17,7 +17,6 @@ from magtwin.field.sources.bodies import (
     Body,
     demagnetising,
     induced_magnetization,
-    mesh_moments,
 )
 from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.frames import quat_from_rpy, rotate
@@ -198,13 +197,6 @@ def test_bodies_add_and_turn_with_their_magnetization():
     assert_array_equal(Bodies([replace(things[0], magnetization=np.zeros(3))]).field_nt(p), 0 * p)
 
 
-def test_no_bodies_make_no_field_and_points_that_are_none_have_none():
-    assert_array_equal(Bodies().field_nt(np.ones((2, 3, 3))), np.zeros((2, 3, 3)))
-    p = np.array([[0.0, 0.0, 1.0], [np.nan, 0.0, 0.0], [0.0, np.inf, 0.0], [1e9, -1e9, 0.0]])
-    field = Bodies([KINDS["cuboid"]]).field_nt(p)
-    assert_array_equal(np.isfinite(field).all(axis=1), [True, False, False, True])
-
-
 def test_shapes_that_do_not_fit_are_refused():
     from magtwin.errors import InputError
 
@@ -283,12 +275,3 @@ def test_a_needle_is_magnetised_along_itself_and_hardly_across():
 
 
 # Meshes
-
-
-@settings(deadline=None, max_examples=30)
-@given(st.tuples(*[st.floats(0.01, 10)] * 3), st.tuples(*[st.floats(-5, 5)] * 3))
-def test_moments_of_a_mesh_are_those_of_the_box_that_it_is(size, shift):
-    volume, centroid, second = mesh_moments(CUBE * size + shift, SIDES)
-    assert volume == pytest.approx(np.prod(size), rel=1e-9)
-    assert_allclose(centroid, shift, atol=1e-9)
-    assert_allclose(second, np.diag(np.square(size)) / 12, rtol=1e-7, atol=1e-9)

@@ -8,7 +8,6 @@ from numpy.testing import assert_allclose
 
 from magtwin.errors import InputError
 from magtwin.field.sources.earth import earth_field_nt
-from magtwin.spec.magnetics import SPAN
 
 GAINESVILLE = (29.65, -82.35, 50.0)
 
@@ -38,13 +37,6 @@ def coefficients(day):
     k = min(int(np.searchsorted(days, when, side="right")) - 1, len(days) - 2)
     part = (when - days[k]) / (days[k + 1] - days[k])
     return [t.iloc[k] + part * (t.iloc[k + 1] - t.iloc[k]) for t in tables]
-
-
-def test_the_span_is_that_of_the_coefficients():
-    from ppigrf.ppigrf import read_shc
-
-    days = read_shc()[0].index
-    assert (days[0].date(), days[-1].date()) == SPAN
 
 
 def synthesis(latitude_deg, longitude_deg, height_m, day):

@@ -6,7 +6,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
-from magtwin.field.survey import folder as survey
 from magtwin.field.survey.folder import read_grid
 from magtwin.field.survey.nodes import node_map, read_survey
 from magtwin.field.survey.readings import Readings, taken_of
@@ -61,15 +60,6 @@ def test_rows_may_come_in_any_order(tmp_path):
     assert_array_equal(plain.values_nt, mixed.values_nt)
 
 
-def test_coordinates_with_rounding_are_one_grid(tmp_path):
-    field = read_survey(write_survey(tmp_path, h90=layer_text(90).replace("0.5,", "0.50000000000000004,")))[0]
-    assert field.cell_m == (0.5, 0.5)
-
-
-def test_a_spreadsheets_byte_order_mark_is_no_obstacle(tmp_path):
-    read_survey(write_survey(tmp_path, h0=b"\xef\xbb\xbf" + layer_text(0).encode()))
-
-
 def test_headings_need_not_be_four_when_they_are_even_or_named(tmp_path):
     eight = write_survey(tmp_path / "eight", headings=[45 * k for k in range(8)])
     assert len(read_survey(eight)[0].headings_rad) == 8
@@ -88,23 +78,6 @@ def test_the_report_tells_the_worst_heading_and_repeated_readings(tmp_path):
     assert got["largest heading deviation"].note == "90_map.csv:4, at (0, 0.5) m"
     assert got["median heading deviation"].value == 0
     assert got["repeated readings"].value == 1
-
-
-def test_map_and_report_come_from_one_reading_of_the_files(tmp_path, monkeypatch):
-    read = []
-    monkeypatch.setattr(survey, "_read_layer", lambda *a, of=survey._read_layer: read.append(a) or of(*a))
-    folder = write_survey(tmp_path)
-    field, report = read_survey(folder, name="a")
-    assert len(read) == 4
-    assert report.title == f"survey {folder}"
-    assert figures(report).items() >= figures(field.report()).items()
-    assert_array_equal(read_survey(folder, name="a")[0].values_nt, field.values_nt)
-
-
-def test_recorded_headings_are_compared_on_the_circle(tmp_path):
-    turned = layer_text(180).replace(str(np.pi), str(np.radians(-179)))
-    got = figures(read_survey(write_survey(tmp_path, h180=turned))[1])
-    assert got["largest heading deviation"].value == pytest.approx(1, abs=1e-3)
 
 
 def test_the_real_survey_has_the_published_figures(real_data):
@@ -329,11 +302,3 @@ def test_headings_far_from_the_names_of_the_files_are_a_doubt(tmp_path):
     (doubt,) = report.metadata["doubts"]
     assert doubt.startswith("4 of 4 headings are recorded otherwise than their files are named")
     assert "doubts" not in read_survey(write_survey(tmp_path))[1].metadata
-
-
-def test_a_gridded_survey_that_spans_far_has_a_note(tmp_path):
-    texts = {f"h{h}": layer_text(h).replace("0.5,", "150,") for h in (0, 90, 180, 270)}
-    report = read_survey(write_survey(tmp_path, **texts))[1]
-    assert report.metadata["taken"] == [
-        "x and y in metres, over 150 m: if these are cm, write them in metres"
-    ]
