@@ -10,6 +10,7 @@ import math
 import os
 import shutil
 import struct
+import warnings
 import zipfile
 import zlib
 from collections import Counter
@@ -23,7 +24,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError, find
+from magtwin.errors import InputError, RepairWarning, find
 from magtwin.files.budget import BUDGETS, check_count, check_decoded, check_size, decoded_limit
 from magtwin.files.file import check_zip, existing
 from magtwin.files.outputs import check_free, output
@@ -41,9 +42,14 @@ from magtwin.run.arrow import (
 from magtwin.run.run import COLUMNS, Run, check_clock
 from magtwin.run.spool import Spool, blocks
 from magtwin.tables.parquet import load_parquet
+from magtwin.tables.quantities import QUANTITIES
+from magtwin.tables.table import Column, Table
 
 _ABOUT = "magtwin"
 """Name of the member of an npz with the metadata, and first word of a CSV."""
+
+_OWN = {("t",): ("t",), ("x", "y"): ("p_world_base_x", "p_world_base_y"), ("heading",): ("yaw",)}
+"""Columns of a Run that are known by the quantity that a table of another program names."""
 
 NUMBER = 8
 """Bytes of a number in memory."""
@@ -114,8 +120,8 @@ def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | N
             return _read_long(path, [path], columns)
         table = load_parquet(path)
         if columns:
-            table = _on_the_floor(table.rename_columns(_renamed(table.column_names, columns, path)))
-        return run_of(table, path)
+            table = table.rename_columns(_renamed(table.column_names, columns, path))
+        return run_of(table if FACTS in (table.schema.metadata or {}) else _by_quantity(table, path), path)
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: damaged Parquet (a name is no text); write it again") from error
 
@@ -319,7 +325,7 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
         )
     fields = [f.with_metadata(said.get(f.name) or None) for f in table.schema]
     table = table.cast(pa.schema(fields, metadata={FACTS: metadata}))
-    return run_of(_on_the_floor(table) if columns else table, path)
+    return run_of(table if said else _by_quantity(table, path), path)
 
 
 def _renamed(names: Sequence[str], columns: Mapping[str, str], path: Path) -> list[str]:
@@ -331,6 +337,23 @@ def _renamed(names: Sequence[str], columns: Mapping[str, str], path: Path) -> li
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
     return [own.get(name, name) for name in names]
+
+
+def _by_quantity(table: pa.Table, path: Path) -> pa.Table:
+    """A table of another program, with the names and units of a Run for what it names otherwise."""
+    for symbols, own in _OWN.items():
+        columns = Table(tuple(Column(name, (), path, None) for name in table.column_names))
+        if not set(own) & set(table.column_names) and (labels := columns.find(*symbols)):
+            names = dict(zip(labels, zip(symbols, own, strict=True), strict=True))
+            for k, label in enumerate(table.column_names):
+                if label in names and not pa.types.is_string(table.schema.field(k).type):
+                    symbol, name = names[label]
+                    factor = QUANTITIES[symbol].units.get(columns.unit(label, symbol), 1.0)
+                    values = factor * table.column(k).to_numpy()
+                    table = table.set_column(k, name, pa.array(values))
+            text = f"{path}: read {' and '.join(labels)} as {' and '.join(own)}"
+            warnings.warn(text, RepairWarning, stacklevel=4)
+    return _on_the_floor(table)
 
 
 def _on_the_floor(table: pa.Table) -> pa.Table:

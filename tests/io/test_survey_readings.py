@@ -273,14 +273,6 @@ def test_a_quaternion_is_taken_by_the_letters_of_its_names(tmp_path):
     assert taken(readings) == ["qw,qx,qy,qz as qx,qy,qz,qw, by their names (--quaternion)"]
 
 
-def test_headings_in_degrees_are_refused_until_said_so_and_turns_that_count_are_taken(tmp_path):
-    path = file(tmp_path, "x,y,heading,field\n0,0,1,41000\n1,0,90,41500\n")
-    with pytest.raises(InputError, match=r"a\.csv:3: heading 90 is beyond a full turn in radians"):
-        read_readings(path)
-    assert_allclose(read_readings(path, columns=Columns(heading_unit="deg")).yaw, np.radians([1, 90]))
-    assert_array_equal(read_readings(path, columns=Columns(heading_unit="rad")).yaw, [1, 90])
-
-
 @settings(max_examples=30, deadline=None)
 @given(yaw=st.floats(-3, 3), roll=st.floats(-0.3, 0.3), pitch=st.floats(-0.3, 0.3))
 def test_a_vector_in_body_axes_with_a_quaternion_is_the_world_vector_turned_back_by_the_heading(
@@ -455,18 +447,6 @@ def test_the_same_readings_give_the_same_bytes_with_units_on_every_column(tmp_pa
         save_readings(readings, tmp_path / "a.parquet")
 
 
-def test_readings_of_other_programs_parquet_go_by_column_names(tmp_path):
-    import pyarrow as pa
-
-    pq.write_table(
-        pa.table({"px": [0.0, 1.0], "py": [0, 1], "yaw": [0.0, 1.0], "b": [41.0, 42.0]}), tmp_path / "a.pq"
-    )
-    readings = read_readings(tmp_path / "a.pq", columns=Columns(x="px", y="py", field="b", unit="uT"))
-    assert_array_equal(readings.b_nt, [41_000, 42_000])
-    with pytest.raises(InputError, match="no Readings: metadata 'magtwin_readings' is missing"):
-        load_readings(tmp_path / "a.pq")
-
-
 @pytest.mark.parametrize("change", ["{", "[]", "{}", '{"grid": {"rows": "no"}}', "null"])
 def test_damaged_metadata_is_refused(tmp_path, change):
     readings = read_readings(file(tmp_path, ROWS))
@@ -605,21 +585,6 @@ def test_a_gridded_survey_is_not_one_of_several_sources(tmp_path, real_data):
         read_readings(real_data / "aprilab/maps", file(tmp_path, ROWS))
 
 
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"created": "last May"}, "created of Readings must be a day YYYY-MM-DD, got 'last May'"),
-        ({"created": 20260102}, "created of Readings must be a text, got 20260102"),
-        ({"licence": None}, "licence of Readings must be a text, got None"),
-        ({"p_xy": [[0.0, -1e9]]}, r"p_xy of Readings lies within 1e\+08 m of the origin, got .* in row 0"),
-    ],
-)
-def test_what_a_survey_says_of_itself_has_its_form(changes, said):
-    given = {"p_xy": [[0.0, 0.0]], "yaw": [0.0], "b_nt": [4e4]}
-    with pytest.raises(InputError, match=said):
-        Readings(**{**given, **changes})
-
-
 @pytest.mark.parametrize("every", [slice(2, None, 3), slice(25, None)])
 def test_rows_of_two_units_are_refused_by_the_first_line_that_is_off_unless_the_unit_is_given(
     tmp_path, every
@@ -687,12 +652,6 @@ def test_a_pattern_stands_for_the_files_that_match_it_in_the_order_of_their_name
     assert same(read_readings("drive_?.csv"), want)
     with pytest.raises(InputError, match=r"^no file or folder matches 'nowhere/\*\.csv'; check the pattern$"):
         read_readings("nowhere/*.csv")
-
-
-def test_a_file_whose_name_looks_like_a_pattern_is_that_file(tmp_path):
-    file(tmp_path, ROWS, "a1.csv")
-    own = file(tmp_path, ROWS.replace("41000", "42000"), "a[1].csv")
-    assert read_readings(own).b_nt[0] == 42_000
 
 
 def test_a_folder_of_parquet_files_is_several_runs(tmp_path):

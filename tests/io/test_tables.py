@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, RepairWarning
 from magtwin.io.formats import read_run
 from magtwin.io.tables import (
     ParquetParts,
@@ -142,7 +142,7 @@ def changed(change):
         (changed(lambda content: b"t,b_total_nt\n0,41000\n"), "not a Parquet file: it begins with"),
         (changed(lambda content: content[:-100]), "cut short"),
         (changed(lambda content: content[:4] + bytes(1996) + content[2000:]), "damaged Parquet"),
-        (table(time=[0.0, 1.0], b=[1.0, 2.0]), "column 't' is missing"),
+        (table(clock=[0.0, 1.0], b=[1.0, 2.0]), "column 't' is missing"),
         (table(t=[0.0], odom_p_x=[1.0]), "column 'odom_p_y' is missing beside 'odom_p_x'"),
         (table(t=["now", "then"]), "column 't' must hold numbers or flags"),
         (table(t=[0.0, 1.0], yaw=[0.5, None]), "column 'yaw', row 1: no value"),
@@ -309,6 +309,17 @@ def test_a_csv_of_a_spreadsheet_is_a_run_where_the_names_are(tmp_path):
     assert np.array_equal(run["flag_bump"], [False, True])
 
 
+def test_a_csv_of_another_program_is_a_run_by_the_names_and_units_of_its_quantities(tmp_path):
+    (tmp_path / "run.csv").write_text(
+        "time [ms],pos_x,pos_y,theta_deg,b_total_nt\n0,1,2,90,41000\n500,1,3,0,41001\n"
+    )
+    with pytest.warns(RepairWarning, match="as p_world_base_x and p_world_base_y"):
+        run = read_csv(tmp_path / "run.csv")
+    assert run["t"].tolist() == [0, 0.5]
+    assert run["p_world_base"].tolist() == [[1, 2, 0], [1, 3, 0]]
+    assert run["yaw"].tolist() == [np.pi / 2, 0]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -320,7 +331,7 @@ def test_a_csv_of_a_spreadsheet_is_a_run_where_the_names_are(tmp_path):
         (b"t,yaw\n0,1\n1,\n", "column 'yaw', row 1: no value; write nan"),
         (b"t,yaw,yaw\n0,1,2\n", "two columns are called 'yaw'"),
         (b"t;yaw\n0;1,5\n", "columns are separated by ';'; save it with commas"),
-        (b"time,yaw\n0,1\n", "not a Run: column 't' is missing"),
+        (b"clock,yaw\n0,1\n", "not a Run: column 't' is missing"),
         (b"t,yaw\n0,1\n0,2\n", "row 1 has 0 s after 0 s"),
         (b"t,yaw\n2,1\n1,2\n", "t must ascend from row to row, but row 1 has 1 s after 2 s"),
         (b"t\nnan\n", "t must be finite, got nan in row 0"),

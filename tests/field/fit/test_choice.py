@@ -7,8 +7,8 @@ from test_fit import drive
 from test_gp import survey
 
 from magtwin.field.fit import choice
-from magtwin.field.fit.choice import CANDIDATES, CHOSEN, RMSE, SCORE, choice_report, fit_auto
-from magtwin.field.fit.fit import fit, raster
+from magtwin.field.fit.choice import CANDIDATES, CHOSEN, RMSE, SCORE, fit_auto
+from magtwin.field.fit.fit import fit
 from magtwin.field.fit.methods import METHODS, FittedModel
 from magtwin.field.fit.mixture import Mixture, mixed
 
@@ -52,23 +52,6 @@ def test_a_choice_is_repeated_to_the_last_bit(chosen):
     assert again.parameters == model.parameters
     for a, b in zip(*(m.predict(readings.p_xy, readings.yaw) for m in (again, model)), strict=True):
         assert_array_equal(a, b)
-
-
-def test_the_report_has_a_line_for_every_candidate(chosen):
-    _, model, _ = chosen
-    figures = {f.name: f for f in choice_report(model.parameters).figures}
-    assert figures["chosen method"].value == model.parameters[CHOSEN]
-    assert "leads the next by" in figures["chosen method"].note
-    assert "log score" in figures["held out, gp matern"].note
-    assert figures["held out, gp matern"].unit == "nT"
-    assert choice_report({}).figures == ()
-
-
-def test_a_map_keeps_the_choice(chosen):
-    readings, model, _ = chosen
-    field = raster(model, readings, spacing_m=0.25, headings_rad=(0.0, 1.5))
-    assert field.parameters[CHOSEN] == model.parameters[CHOSEN]
-    assert field.method == model.method
 
 
 def test_few_readings_get_a_harmonic_fit():

@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_gp import survey, truth
 
-from magtwin.field.fit.fit import OFFSET_SD_NT, fit, grid_report, offset_sd_nt, raster
+from magtwin.field.fit.fit import OFFSET_SD_NT, fit, grid_report, raster
 from magtwin.field.fit.passes import by_pass
 from magtwin.field.maps.map import OFFSET
 from magtwin.field.maps.statistics import map_metadata
@@ -72,11 +72,6 @@ def test_the_noise_of_a_drive_is_that_between_its_passes(method):
 
 
 @pytest.mark.parametrize("method", ["gp", "harmonic"])
-def test_the_noise_of_passes_that_agree_stays_that_of_the_sensor(method):
-    assert np.sqrt(fitted(method, 0.0).noise_nt2) < 4 * WHITE_NT
-
-
-@pytest.mark.parametrize("method", ["gp", "harmonic"])
 def test_another_drive_lies_in_the_intervals_of_the_first(method):
     other, model = loops(seed=3), fitted(method)
     value, variance = model.predict(other.p_xy, other.yaw)
@@ -92,13 +87,6 @@ def test_a_map_of_one_drive_holds_an_offset_and_says_so():
     assert field.parameters[OFFSET] == field.offset_sd_nt == OFFSET_SD_NT
     for report in (grid_report(field), map_metadata(field)):
         assert {f.name: f for f in report.figures}["offset sd"].value == OFFSET_SD_NT
-
-
-def test_a_survey_at_rest_several_runs_and_readings_without_times_leave_no_offset():
-    one = loops()
-    several = one.with_(run=np.arange(len(one)) // 750, runs=("a", "b"))
-    assert offset_sd_nt(one) == OFFSET_SD_NT
-    assert [offset_sd_nt(r) for r in (survey(), several, one.with_(t=None))] == [0.0, 0.0, 0.0]
 
 
 def test_a_problem_takes_the_offset_of_a_map_once_as_a_bias():

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
 from magtwin.field.grid import Grid
-from magtwin.field.maps.continuation import LARGEST_STEP_DOWN, at_height
+from magtwin.field.maps.continuation import at_height
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.harmonic import HarmonicField
 
@@ -75,16 +75,6 @@ def test_a_wave_shrinks_by_exp_of_its_wavenumber_times_the_step():
     assert_allclose(inside(up, field, 1.5), inside(wave * np.exp(-0.2 * k), field, 1.5), atol=0.5)
 
 
-def test_a_small_step_down_is_the_closed_form_too():
-    sheet = a_sheet(0.3)
-    field = a_map(sheet)
-    height = HEIGHT_M - LARGEST_STEP_DOWN * 0.25
-    exact = sheet.magnitude_nt(*field.grid.poses(), height_m=height)
-    error = inside(at_height(field, height).values_nt - exact, field)
-    moved = inside(field.values_nt - exact, field)
-    assert np.sqrt(np.mean(error**2)) < 0.05 * np.sqrt(np.mean(moved**2))
-
-
 def test_a_harmonic_field_gives_every_height_exactly_and_leads_back():
     sheet = a_sheet(3.0)
     field = a_map(sheet, harmonic=sheet)
@@ -127,16 +117,6 @@ def test_errors_of_the_readings_stay_within_the_variance_that_is_carried(step):
     common = at_height(replace(field, values_nt=field.values_nt + 10), HEIGHT_M + step).values_nt - clean
     assert_allclose(common, 10)  # an error that all nodes share does not shrink on the way
     assert np.all(common**2 < 1.0001 * carried)
-
-
-def test_no_variance_stays_unknown_and_a_harmonic_field_far_below_has_none():
-    sheet = a_sheet(1.0)
-    field = a_map(sheet, harmonic=sheet)
-    assert at_height(field, 0.5).variance_nt2 is None
-    assert at_height(a_map(sheet), 0.5).variance_nt2 is None
-    known = replace(field, variance_nt2=np.ones_like(field.values_nt))
-    assert at_height(known, 0.5).variance_nt2 is not None
-    assert at_height(known, 0.1).variance_nt2 is None
 
 
 def test_dipoles_of_a_survey_whose_height_is_unknown_are_not_taken_to_a_height_above_the_floor():

@@ -53,12 +53,6 @@ def test_nodes_give_their_values_whatever_the_number_of_turns():
             assert_allclose(got, field.values_nt[layer], rtol=0, atol=1e-9)
 
 
-def test_one_layer_serves_every_heading():
-    field = field_map(headings=np.array([1.2]))
-    p, yaw = poses(field, 100)
-    assert_array_equal(field.lookup(p, yaw), field.lookup(p, 0.0))
-
-
 @given(st.floats(-3, 3), st.floats(-1.75, 1.75), st.floats(-50, 50), st.integers(-4, 4), st.integers(0, 3))
 @settings(max_examples=60, deadline=None)
 def test_turning_the_layers_turns_the_lookup(x, y, yaw, turns, quarter):
@@ -86,15 +80,6 @@ def test_outside_the_map_gives_nan_the_border_or_a_refusal():
         field.lookup(p, 0.0, outside="raise")
     with pytest.raises(InputError, match="outside must be"):
         field.lookup(p, 0.0, outside="zero")
-
-
-@pytest.mark.parametrize("outside", ["nan", "clamp", "raise"])
-def test_nan_in_gives_nan_out_whatever_is_asked_for_outside(outside):
-    field = field_map()
-    p = np.array([[np.nan, 0], [0, np.nan], [0, 0], [0, 0], [0, 0]])
-    yaw = np.array([0, 0, np.nan, np.inf, 0])
-    got = field.lookup(p, yaw, outside=outside)
-    assert_array_equal(np.isnan(got), [True, True, True, True, False])
 
 
 def test_the_border_belongs_to_the_map_and_rounding_does_not_lose_it():

@@ -144,15 +144,6 @@ def test_readings_that_stand_on_no_grid_make_no_nodes():
         node_map(Readings(p_xy=[[0, 0]], yaw=[0], b_nt=[41_000], name="mow"))
 
 
-@pytest.mark.parametrize(("unit", "scale"), [("uT", 1e-3), ("T", 1e-9)])
-def test_a_survey_in_another_unit_is_read_when_it_is_said(tmp_path, unit, scale):
-    values = [v * scale for v in (41_000, 41_200, 40_900, 41_100)]
-    folder = write_survey(tmp_path, **{f"h{h}": layer_text(h, values) for h in (0, 90, 180, 270)})
-    assert_allclose(read_grid(folder, unit=unit).b_nt[:2], [41_000, 41_200])
-    with pytest.raises(InputError, match=f"in {unit} it would be 41,050 nT: give --unit {unit}"):
-        read_grid(folder)
-
-
 ROW2 = "0.5,0.0,1.5707963267948966,41200\n"  # line 3 of 90_map.csv
 
 REFUSALS = {
@@ -260,18 +251,6 @@ def test_a_survey_is_refused_in_one_line_that_says_where(tmp_path, case):
     assert re.search(REFUSALS[case][-1], text), text
     assert text.startswith(str(folder))
     assert "\n" not in text
-
-
-def test_a_heading_that_was_not_asked_for_is_refused(tmp_path):
-    with pytest.raises(InputError, match="heading 90, 270 deg is not among the expected 0, 180"):
-        read_survey(write_survey(tmp_path), headings_deg=(0, 180))[0]
-
-
-def test_the_real_survey_is_known_to_its_headings_places_and_noise(real_data):
-    field = read_survey(real_data / "aprilab" / "maps")[0]
-    sd = np.sqrt(field.variance_nt2[field.valid])
-    assert 40 < np.median(sd) < 100
-    assert np.sqrt(np.mean(sd**2)) == pytest.approx(85, abs=10)
 
 
 def in_degrees(text):
