@@ -160,7 +160,7 @@ class Table:
         if symbol and (unit := self.unit(name, symbol)):
             units = QUANTITIES[symbol].units
             if unit not in units:
-                usual = {factor: known.replace("_", "/") for known, factor in reversed(units.items())}
+                usual = {factor: known.replace("_", "/") for known, factor in reversed(list(units.items()))}
                 text = f"{column.name[:QUOTED]!r} is in no unit of {symbol}"
                 raise InputError(f"{self.path}: {text}; {hint(unit, usual.values())}")
             factor = units[unit]
