@@ -52,7 +52,6 @@ LOCALIZE = "localize run.npz --map lab --out new"
         (FIT, "--headings-deg", ",".join(map(str, np.arange(0, 360, 0.1))), "--headings-deg names 3,600"),
         (FIT, "--scale", "-1", "--scale: scale, the factor to nT, must be above 0"),
         (FIT.replace("trilinear", "harmonic"), "--earth", "nan,0,0", "--earth: earth_nt must be three"),
-        ("map validate survey.csv", "--within-m", "-1", "--within-m must be 0 m or more"),
         (SURVEY, "--readings", HUGE, "--readings must be at least 1 and at most 100,000"),
         (SURVEY, "--heading-error-deg", "1e300", "--heading-error-deg must be from 0 to 90 deg"),
         (SURVEY, "--spacing-m", "0", "--spacing-m must be above 0 m"),

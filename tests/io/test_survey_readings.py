@@ -321,13 +321,6 @@ def test_rows_without_a_value_are_left_out_and_the_source_tells_how_many(tmp_pat
         read_readings(file(tmp_path, "x,y,heading,field\n0,0,0,nan\n", "b.csv"))
 
 
-def test_a_column_tells_runs_apart(tmp_path):
-    path = file(tmp_path, "x,y,yaw,field,day\n0,0,0,41000,tue\n1,0,0,41500,mon\n2,0,0,41200,tue\n")
-    readings = read_readings(path, columns=Columns(run_column="day"))
-    assert readings.runs == ("a tue", "a mon")
-    assert_array_equal(readings.run, [0, 1, 0])
-
-
 def test_files_joined_by_a_plus_stand_side_by_side(tmp_path):
     for name, text in (
         ("1-t.csv", "5\n6\n"),

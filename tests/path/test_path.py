@@ -23,7 +23,6 @@ from magtwin.path import (
     read_path_csv,
     resolve_path,
     sine,
-    spline,
     split_lawnmower,
 )
 from magtwin.spec.obstacles import Obstacles
@@ -287,12 +286,8 @@ def test_points_that_are_no_path_are_refused(points, says):
             r"'lawnmower': step_m 1e-12 m .* would make 1e\+13 points, more than",
         ),
         (lambda: lawnmower(x_last_m=math.inf), "'lawnmower': .* would make inf points"),
-        (lambda: spline([[0, 0], [3, 4], [0, 0]], spacing_m=1e-9), "'spline': spacing_m 1e-09 m over 10 m"),
         (lambda: lawnmower(step_m=0.0), "step_m of a lawnmower must be above 0"),
         (lambda: split_lawnmower(y_split_m=1.4), "y_split_m of a split_lawnmower must lie between"),
-        (lambda: spline([[0, 0], [1, 0], [1, 0]]), "needs three points"),
-        (lambda: spline([[0, 0], [1, 0], [2, 1]], spacing_m=0.0), "above 0 m"),
-        (lambda: spline([[0, 0], [1, np.nan], [2, 1]]), "not finite"),
         (lambda: curvilinear(depth=-1.0), r"depth of .* at least 0 and below 1, got -1\.0"),
         (lambda: curvilinear(depth=math.nan), "depth of .* got nan"),
         (lambda: curvilinear(lobes=2.5), r"lobes of .* whole number, got 2\.5"),
@@ -336,27 +331,6 @@ def test_a_split_lawnmower_mows_one_half_and_then_the_other_back():
     gap = path.p_xy[~low, 1].min() - path.p_xy[low, 1].max()
     assert gap == pytest.approx(0.5)
     assert_allclose(path.p_xy[0, 0], path.p_xy[-1, 0])
-
-
-@settings(deadline=None)  # the first call imports scipy.interpolate
-@given(st.integers(3, 9), st.integers(0, 2**32 - 1), st.booleans())
-def test_a_spline_goes_through_its_points_without_a_kink(count, seed, closed):
-    rng = np.random.default_rng(seed)
-    angle = np.sort(rng.uniform(0, 2 * np.pi, count)) + np.arange(count)
-    points = np.column_stack([angle, rng.uniform(-1, 1, count)])
-    path = spline(points, closed=closed)
-    _, distance = path.nearest(points)
-    assert np.abs(distance).max() < 1e-9
-    fine = spline(points, closed=closed, spacing_m=0.0002)
-    at = np.linspace(0.1, 0.9, 50) * fine.length
-    wide, narrow = (np.abs(fine.turn(at, reach)) for reach in (0.002, 0.0005))
-    assert np.all(narrow < 0.6 * wide + 1e-3), "a bend turns less within less of it, a kink does not"
-
-
-def test_a_closed_spline_through_four_points_of_a_circle_is_nearly_round():
-    angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-    path = spline(np.column_stack([np.cos(angle), np.sin(angle)]), closed=True)
-    assert_allclose(np.hypot(*path.p_xy.T), 1.0, atol=2e-4)
 
 
 DESK = Obstacles(("/World/Desk",), (np.array([[0.5, -0.2], [1.0, -0.2], [1.0, 0.2], [0.5, 0.2]]),))

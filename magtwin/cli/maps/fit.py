@@ -166,7 +166,6 @@ def map_validate(
     split: Literal["checkerboard", "heading", "run", "block"] | None = None,
     kernel: Kernel = None,
     earth: Earth = None,
-    within_m: float | None = None,
     keep_stuck: KeepStuck = False,
 ) -> Done:
     """Measure how well each method predicts readings that were left out of its fit.
@@ -180,8 +179,6 @@ def map_validate(
     split
         What is left out at a time: every other node, one heading, one run, or blocks of the floor. Default:
         nodes of a gridded survey, runs if there are several, else blocks.
-    within_m
-        Count only readings this near to a reading that was fitted [m].
     """
     from magtwin.io.surveys.maps import validate_methods
 
@@ -192,7 +189,6 @@ def map_validate(
             split=split,
             kernel=kernel,
             earth_nt=None if earth is None else earth_nt(earth),
-            within_m=within_m,
             keep_stuck=keep_stuck,
             progress=advance,
         )

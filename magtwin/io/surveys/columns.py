@@ -55,9 +55,6 @@ class Columns:
     """Column of time [s], or in the unit of its name. Default: t, time or timestamp. Times since 1970 in ms,
     us or ns are told by their size."""
 
-    run_column: str = ""
-    """Column that identifies the run of each row, by numbers or text."""
-
     def __post_init__(self) -> None:
         for name, count in (("quaternion", 4), ("vector", 3)):
             given = getattr(self, name)

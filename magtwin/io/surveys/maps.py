@@ -138,7 +138,6 @@ def validate_methods(
     split: Split | None = None,
     kernel: Literal["matern", "poisson"] | None = None,
     earth_nt: Vector | None = None,
-    within_m: float | None = None,
     keep_stuck: bool = False,
     progress: Progress | None = None,
 ) -> Report:
@@ -150,7 +149,6 @@ def validate_methods(
         split: What is left out. None: nodes of a gridded survey, runs if there are several, else blocks.
         kernel: Covariance of the Gaussian process. None: poisson.
         earth_nt: The Earth's field in world axes for the harmonic fit [nT].
-        within_m: Count only readings this near to one that was fitted [m].
         keep_stuck: Whether stuck and repeated readings stay in.
         progress: Called with the number done, the total, and a word.
 
@@ -165,7 +163,7 @@ def validate_methods(
     readings, _ = survey_and_report(sources, keep_stuck=keep_stuck)
     if split is None:
         split = "checkerboard" if readings.grid is not None else "run" if len(readings.runs) > 1 else "block"
-    return check(readings, chosen, split=split, within_m=within_m, options=options, progress=progress)
+    return check(readings, chosen, split=split, options=options, progress=progress)
 
 
 def _is_grid(source: Path, columns: Columns) -> bool:

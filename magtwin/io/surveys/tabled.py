@@ -67,7 +67,6 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
     if vector is not None:
         _check_vectors(table, columns, vector[known], b[known], turn[known])
         vector = levelled(vector, turn, columns.axes or "body")[known]
-    run, runs = _runs(table, columns, name, known)
     notes = [f"; {TAKEN}{note.replace('; ', ', ')}" for note in taken]  # "; " separates them
     return Readings(
         p_xy=p[known],
@@ -75,8 +74,7 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
         b_nt=b[known],
         b_body_nt=vector,
         t=None if t is None else t[known],
-        run=run,
-        runs=runs,
+        runs=(name,),
         name=name,
         source=source + left_out(known) + "".join(notes),
     )
@@ -364,13 +362,3 @@ def _field(table: Table, columns: Columns) -> tuple[Array | None, Array]:
     return vector, factor * table.numbers(columns.field) if vector is None or columns.field else (
         np.linalg.norm(vector, axis=1)
     )
-
-
-def _runs(table: Table, columns: Columns, stem: str, known: NDArray[np.bool_]) -> Any:
-    """Run of each known row, and names of the runs."""
-    if not columns.run_column:
-        return None, (stem,)
-    words = [word for word, is_known in zip(table.texts(columns.run_column), known, strict=True) if is_known]
-    runs = list(dict.fromkeys(words))
-    index = {word: i for i, word in enumerate(runs)}
-    return np.array([index[word] for word in words]), tuple(f"{stem} {word}" for word in runs)

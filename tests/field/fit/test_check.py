@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from test_fit import drive
 from test_gp import survey
 
@@ -67,16 +68,12 @@ def test_a_checkerboard_leaves_nodes_out_at_all_headings_and_predicts_each_once(
     assert figures(report)["readings predicted"] == len(readings)
 
 
-def test_runs_are_left_out_one_at_a_time_and_within_keeps_near_readings():
+def test_runs_are_left_out_one_at_a_time():
     readings = drive(count=300)
     run = (readings.p_xy[:, 0] > 0).astype(int)  # two halves of the floor: no reading near the other half's
     readings = readings.with_(run=run, runs=("west", "east"))
-    far = figures(check(readings, ["trilinear"], split="run"))
-    near = figures(check(readings, ["trilinear"], split="run", within_m=0.1))
-    assert far["readings predicted"] == 300
-    assert 0 < near["readings predicted"] < 60
-    with pytest.raises(InputError, match="left to predict within 1e-06 m"):
-        check(readings, ["trilinear"], split="run", within_m=1e-6)
+    found = figures(check(readings, ["trilinear"], split="run"))
+    assert (found["readings predicted"], found["turns"]) == (300, 2)
 
 
 def test_a_heading_is_left_out_whole_and_told_by_the_others(monkeypatch):
@@ -142,8 +139,9 @@ def test_on_a_real_drive_runs_tell_other_runs_within_10_cm(real_data):
     readings = Readings(
         p_xy=np.vstack(p), yaw=np.zeros(len(run)), b_body_nt=b, run=run, runs=tuple("12345"), name="drive"
     )
-    turns = [(np.flatnonzero(np.isin(run, [0, 2, 4])), np.flatnonzero(np.isin(run, [1, 3])))]
-    found = figures(check(readings, ["trilinear", "gp"], split=turns, within_m=0.1))
+    train, test = (np.flatnonzero(np.isin(run, runs)) for runs in ([0, 2, 4], [1, 3]))
+    near = cKDTree(readings.p_xy[train]).query(readings.p_xy[test])[0] <= 0.1
+    found = figures(check(readings, ["trilinear", "gp"], split=[(train, test[near])]))
     assert found["trilinear RMSE"] < 2250
     assert found["gp RMSE"] < 2110
     assert 85 <= found["gp coverage"] <= 95

@@ -93,12 +93,6 @@ def test_an_unknown_method_or_option_is_refused_with_the_near_one():
         fit(readings, "trilinear", fil=True)
 
 
-def test_a_raster_off_the_readings_is_refused():
-    readings = survey(rows=4, columns=4)
-    with pytest.raises(InputError, match="keep the extent within the readings"):
-        raster(fit(readings, "cubic"), readings, extent=(50, 52, 50, 52))
-
-
 def test_a_map_has_its_surveys_frame_and_datum_and_a_height_only_where_the_survey_has_one():
     given = drive(400).with_(frame="world: x east", datum="the door", height_m=None)
     for method in ("trilinear", "harmonic"):
