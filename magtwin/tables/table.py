@@ -5,7 +5,8 @@ The one reader of tables that other programs wrote: of surveys, paths and comman
 
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,15 +30,13 @@ PARQUET = (".parquet", ".pq")
 _EPOCHS = ((1e17, 1e9, "ns"), (1e14, 1e6, "us"), (1e11, 1e3, "ms"))
 """Least median of times since 1970, ticks per second and unit; below them are seconds."""
 
-_ISO = re.compile(r"\d{4}-\d\d-\d\d", re.ASCII)
-_DATE = re.compile(
-    r"(\d{1,4})([-/.])(\d{1,2}|[A-Za-z]{3})\2(\d{1,4})"
-    r"(?:[ T]+(\d{1,2}):(\d\d)(?::(\d\d)(?:[.,](\d{1,6})\d*)?)? *([AaPp][Mm])?)?",
-    re.ASCII,
-)
-"""A date in another order than that of ISO 8601, and perhaps a time."""
+_DATE = re.compile(r"\d{1,4}[-/.](\d{1,2}|[A-Za-z]{3})[-/.]\d{1,4}", re.ASCII)
+_DAYS = ("%Y-%m-%d", "%d-%m-%Y", "%m-%d-%Y", "%d-%b-%Y")
+"""Orders of a date, with a hyphen for any mark."""
 
-_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_CLOCKS = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")
+"""Times behind a date."""
+
 _READ = "2025-11-22T08:26:40"
 """A date as an error message shows it."""
 
@@ -213,27 +212,21 @@ class Table:
         column = self.column(name)
         is_text = not isinstance(column.cells, np.ndarray) or column.cells.dtype.kind == "O"
         texts = self.texts(name) if is_text else []
-        if not any(_ISO.match(text) or _DATE.fullmatch(text) for text in texts):
+        if not any(map(_DATE.match, texts)):
             for row, text in enumerate(texts):
                 if np.isinf(number_of(text)):
                     wanted = f"a number of seconds, or a date and time such as {_READ}"
                     raise InputError(f"{column.where(row)}: {name} must be {wanted}; got {text[:QUOTED]!r}")
             return self.numbers(name, "t" if self.unit(name, "t") in QUANTITIES["t"].units else "")
-        is_day_first = _is_day_first(texts)
-        seconds = np.full(self.rows, np.nan)
-        for row, text in enumerate(texts):
-            if text.lower() in MISSING:
-                continue
-            try:
-                moment = _moment(text, is_day_first)
-                seconds[row] = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
-            except (ValueError, OverflowError) as error:
-                advice = (
-                    str(error) if isinstance(error, _UnclearDateError) else f"one such as {_READ} is read"
-                )
-                text = f"{name} must be a date and time, got {text[:QUOTED]!r}; {advice}"
-                raise InputError(f"{column.where(row)}: {text}") from None
-        return seconds
+        tried = [_seconds(texts, datetime.fromisoformat), *(_seconds(texts, _reader(day)) for day in _DAYS)]
+        best = max(tried, key=len)
+        if len(best) < len(texts):
+            text = f"{name} must be a date and time, got {texts[len(best)][:QUOTED]!r}"
+            raise InputError(f"{column.where(len(best))}: {text}; one such as {_READ} is read")
+        if any(len(other) == len(best) and other != best for other in tried):
+            text = f"day and month of {name} cannot be told apart; write dates such as {_READ}"
+            raise InputError(f"{column.where(0)}: {text}")
+        return np.array(best)
 
     def texts(self, name: str) -> list[str]:
         """The cells of a column as stripped texts."""
@@ -273,48 +266,34 @@ def _and(names: Sequence[str]) -> str:
     return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)[: 3 * QUOTED]
 
 
-class _UnclearDateError(ValueError):
-    """A date whose day may be its month."""
+def _reader(day: str) -> Callable[[str], datetime]:
+    """A reader of dates in an order of `_DAYS`, and of times behind them."""
+    clocks = list(_CLOCKS)
+
+    def read(text: str) -> datetime:
+        date, _, clock = text.partition(" ")
+        text = f"{re.sub('[/.]', '-', date)} {clock.strip().replace(',', '.')}".strip()
+        for k, form in enumerate(clocks):
+            with suppress(ValueError):
+                moment = datetime.strptime(text, day + form)
+                clocks.insert(0, clocks.pop(k))  # the next text has most likely the same
+                return moment
+        raise ValueError(text)
+
+    return read
 
 
-def _is_day_first(texts: Sequence[str]) -> bool | None:
-    """Whether the days of dates such as 22.11.2025 come before the months; None if no number is above 12."""
-    for text in texts:
-        match = _DATE.fullmatch(text)
-        if match and len(match[1]) < 3 and match[3].isdigit() and max(int(match[1]), int(match[3])) > 12:
-            return int(match[1]) > 12
-    return None
-
-
-def _moment(text: str, is_day_first: bool | None) -> datetime:
-    """The moment of a date.
-
-    Raises:
-        ValueError: It is none; or, as an `_UnclearDateError`, day and month cannot be told apart.
-    """
-    match = _DATE.fullmatch(text)
-    if match is None or _ISO.match(text):
-        return datetime.fromisoformat(text)
-    first, _, middle, last, *clock = match.groups()
-    if not middle.isdigit():
-        day, month, year = first, str(_MONTHS.index(middle.lower()) + 1), last
-    elif len(first) == 4:
-        year, month, day = first, middle, last
-    elif is_day_first is None and first != middle:
-        raise _UnclearDateError(f"day and month cannot be told apart; write dates such as {_READ}")
-    else:
-        day, month = (first, middle) if is_day_first else (middle, first)
-        year = last
-    if len(year) != 4:
-        raise ValueError("a year has four digits")
-    hour, minute, second = (int(word or 0) for word in clock[:3])
-    if clock[4]:
-        if not 1 <= hour <= 12:
-            raise ValueError("an hour before noon or after it is 1 to 12")
-        hour = hour % 12 + 12 * (clock[4].lower() == "pm")
-    return datetime(
-        int(year), int(month), int(day), hour, minute, second, int((clock[3] or "").ljust(6, "0")[:6])
-    )
+def _seconds(texts: Sequence[str], read: Callable[[str], datetime]) -> list[float]:
+    """Seconds since 1970 of dates, up to the first that cannot be read; one without a zone is in UTC."""
+    seconds = list[float]()
+    with suppress(ValueError, OverflowError):
+        for text in texts:
+            if text.lower() in MISSING:
+                seconds.append(np.nan)
+                continue
+            moment = read(text)
+            seconds.append((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp())
+    return seconds
 
 
 def read_table(
