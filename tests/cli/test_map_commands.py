@@ -115,12 +115,6 @@ def test_a_source_that_is_not_all_files_with_checksums_names_none(source):
     assert source_files(source) == {}
 
 
-def test_files_of_one_name_that_differ_are_all_told():
-    other = SHA[::-1].replace("a", "b")
-    source = f"lab.usda sha256:{SHA}; room.usda sha256:{SHA}; lab.usda sha256:{other}; room.usda sha256:{SHA}"
-    assert source_files(source) == {"lab.usda": SHA, "room.usda": SHA, "lab.usda (2)": other}
-
-
 def test_continue_writes_the_map_of_another_height(tmp_path, layer, capsys):
     said = told(capsys, "map", "upward", layer, "--height-m", "1.0", "--out", tmp_path / "up.usdc")
     assert said["figures"]["height"]["value"] == 1.0

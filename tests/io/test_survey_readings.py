@@ -354,18 +354,6 @@ def test_the_real_vector_survey_is_read_from_its_triples(real_data):
     assert_allclose(readings.b_nt[readings.run == 2], np.linalg.norm(raw, axis=1), rtol=1e-15)
 
 
-def test_a_gridded_folder_keeps_recorded_headings_beside_its_nodes(real_data):
-    readings = read_readings(real_data / "aprilab/maps", licence="MIT")
-    table = np.loadtxt(real_data / "aprilab/maps/90_map.csv", delimiter=",")
-    rows = readings.run == 1
-    assert readings.runs[1] == "90_map.csv"
-    assert_array_equal(readings.yaw[rows], table[:, 2])
-    assert_array_equal(readings.b_nt[rows], table[:, 3])
-    p, yaw = readings.grid.poses()
-    assert_allclose(p[tuple(readings.node.T)], readings.p_xy, atol=1e-12)
-    assert_allclose(yaw[tuple(readings.node[rows].T)], np.pi / 2)
-
-
 def test_a_run_becomes_readings_at_the_true_poses_with_lost_lock_not_good(lab_scene, tmp_path):
     import magtwin
     from magtwin.io.tables import write_parquet
@@ -466,7 +454,7 @@ REFUSALS = {
     "x in no length": ("x [px],y,yaw,b\n0,0,0,41000\n", {}, r"a\.csv: 'x \[px\]' is in no unit of x"),
     "no unit fits": ("x,y,yaw,field\n0,0,0,3\n", {}, r"a\.csv: the median of field is 3 nT, .*no usual unit"),
     "missing": (None, {}, r"a\.csv: no such source of readings"),
-    "no x": ("u,y,yaw,field\n0,0,0,41000\n", {}, r"a\.csv: no columns of x and y .*--x NAME --y NAME"),
+    "no x": ("u,y,yaw,field\n0,0,0,41000\n", {}, r"a\.csv: no column of x and of y .*--x NAME --y NAME"),
     "no heading": (
         "x,y,field\n0,0,41000\n",
         {},

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 from test_fit import drive
 from test_gp import survey
 
@@ -10,7 +9,6 @@ from magtwin.errors import InputError
 from magtwin.field.fit.check import check
 from magtwin.field.fit.interpolation import fit_trilinear
 from magtwin.field.fit.methods import METHODS
-from magtwin.field.survey.readings import Readings
 
 
 class Told:
@@ -129,19 +127,3 @@ def test_on_the_real_survey_a_gp_errs_a_quarter_of_what_trilinear_does(real_surv
     assert 85 <= found["gp coverage"] <= 96
     assert 85 <= found["trilinear coverage"] <= 95
     assert found["gp log score"] > found["cubic log score"] > found["trilinear log score"]
-
-
-def test_on_a_real_drive_runs_tell_other_runs_within_10_cm(real_data):
-    folder = real_data / "magnetic-data"
-    p = [np.loadtxt(folder / f"{k}-loc.csv", delimiter=",") for k in range(1, 6)]
-    b = np.vstack([np.loadtxt(folder / f"{k}-mag.csv", delimiter=",") for k in range(1, 6)]) * 1000
-    run = np.repeat(np.arange(5), [len(part) for part in p])
-    readings = Readings(
-        p_xy=np.vstack(p), yaw=np.zeros(len(run)), b_body_nt=b, run=run, runs=tuple("12345"), name="drive"
-    )
-    train, test = (np.flatnonzero(np.isin(run, runs)) for runs in ([0, 2, 4], [1, 3]))
-    near = cKDTree(readings.p_xy[train]).query(readings.p_xy[test])[0] <= 0.1
-    found = figures(check(readings, ["trilinear", "gp"], split=[(train, test[near])]))
-    assert found["trilinear RMSE"] < 2250
-    assert found["gp RMSE"] < 2110
-    assert 85 <= found["gp coverage"] <= 95

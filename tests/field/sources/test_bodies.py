@@ -92,15 +92,6 @@ def test_near_a_body_its_field_is_magpylibs_to_1e_9(kind, part):
     assert np.abs(got - want).max() < 1e-9 * np.linalg.norm(want, axis=1).max()
 
 
-@every_kind
-def test_inside_a_body_its_field_is_magpylibs_too(kind):
-    thing = KINDS[kind]
-    inside = (
-        np.random.default_rng(1).uniform(-0.2, 0.2, (50, 3)) * thing.size_m @ thing.rotation.T + thing.p_world
-    )
-    assert_allclose(Bodies([thing]).field_nt(inside), peer(thing, inside), rtol=1e-9, atol=1e-3)
-
-
 @settings(deadline=None, max_examples=60)
 @given(
     shape=st.sampled_from(["cuboid", "cylinder"]),
@@ -176,15 +167,6 @@ def test_a_sphere_is_its_dipole_outside_and_two_thirds_of_its_magnetization_with
     assert_allclose(Bodies([ball]).field_nt(p), dipole_field_nt(p, [PLACE], [moment]), rtol=1e-9, atol=1e-6)
     within = Bodies([ball]).field_nt(PLACE + np.array([0.01, 0.02, -0.03]))
     assert_allclose(within, 1e9 * 2 / 3 * MU_0 * rotate(TURN, ball.magnetization), rtol=1e-9)
-
-
-def test_what_a_point_is_told_does_not_depend_on_its_company():
-    some = Bodies(list(KINDS.values()), [[0.0, 0.0, 0.0]], [[1.0, 2.0, 3.0]])
-    p = np.random.default_rng(2).uniform(-4, 4, (300, 3))
-    together = some.field_nt(p)
-    alone = np.array([some.field_nt(q) for q in p[:40]])
-    assert_allclose(alone, together[:40], rtol=1e-12, atol=1e-9)
-    assert_array_equal(some.field_nt(p), together)
 
 
 def test_bodies_add_and_turn_with_their_magnetization():

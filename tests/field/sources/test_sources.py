@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from magtwin.field.sources.bodies import Bodies
 from magtwin.field.sources.dipoles import dipole_field_nt
 
 ORIGIN = np.zeros((1, 3))
@@ -43,15 +42,6 @@ def gradient(p, place, moment, step=1e-3):
     near = dipole_field_nt(p + move, place, moment) - dipole_field_nt(p - move, place, moment)
     far = dipole_field_nt(p + 2 * move, place, moment) - dipole_field_nt(p - 2 * move, place, moment)
     return np.moveaxis((8 * near - far) / (12 * step), 0, 1)
-
-
-def test_the_rate_at_a_moving_point_is_the_gradient_along_its_velocity():
-    p, dipoles = some_points(400), some_dipoles(80)
-    v = np.random.default_rng(3).normal(size=(400, 3))
-    field, rate = Bodies((), *dipoles).field_and_rate_nt(p, v)
-    assert_allclose(field, dipole_field_nt(p, *dipoles), rtol=0, atol=1e-11 * np.abs(field).max())
-    slope = gradient(p, *dipoles)
-    assert_allclose(rate, np.einsum("ni,nij->nj", v, slope), rtol=0, atol=1e-8 * np.abs(rate).max())
 
 
 def test_the_field_has_neither_divergence_nor_curl():
