@@ -424,7 +424,7 @@ def _picture(file: Path) -> None:
 
 def _readings(file: Path) -> None:
     call(
-        "io.surveys.readings:save_readings",
+        "field.survey.saved:save_readings",
         call("io.surveys.readings:readings_of_run", _run(), name="drive"),
         file,
     )
