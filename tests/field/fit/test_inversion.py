@@ -221,6 +221,7 @@ def test_headings_that_a_platform_does_not_explain_widen_what_lies_between_them(
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_in_the_default_lab_it_is_four_times_nearer_to_the_exact_field_than_trilinear(lab_scene):
     from magtwin.field.survey.stuck import mask_stuck
     from magtwin.sim.survey import field_at_rest_nt, survey_readings
@@ -239,6 +240,7 @@ def test_in_the_default_lab_it_is_four_times_nearer_to_the_exact_field_than_tril
     assert rms(linear[known] - want) > 4 * rms(got - want)
 
 
+@pytest.mark.slow
 def test_the_real_survey_is_told_to_190_nt_at_nodes_left_out_at_all_headings(real_data):
     from magtwin.field.survey.folder import read_grid
 
