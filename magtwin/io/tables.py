@@ -341,18 +341,18 @@ def _renamed(names: Sequence[str], columns: Mapping[str, str], path: Path) -> li
 
 def _by_quantity(table: pa.Table, path: Path) -> pa.Table:
     """A table of another program, with the names and units of a Run for what it names otherwise."""
+    notes = []
     for symbols, own in _OWN.items():
         columns = Table(tuple(Column(name, (), path, None) for name in table.column_names))
-        if not set(own) & set(table.column_names) and (labels := columns.find(*symbols)):
-            names = dict(zip(labels, zip(symbols, own, strict=True), strict=True))
-            for k, label in enumerate(table.column_names):
-                if label in names and not pa.types.is_string(table.schema.field(k).type):
-                    symbol, name = names[label]
-                    factor = QUANTITIES[symbol].units.get(columns.unit(label, symbol), 1.0)
-                    values = factor * table.column(k).to_numpy()
-                    table = table.set_column(k, name, pa.array(values))
-            text = f"{path}: read {' and '.join(labels)} as {' and '.join(own)}"
-            warnings.warn(text, RepairWarning, stacklevel=4)
+        labels = [] if set(own) & set(table.column_names) else columns.find(*symbols)
+        for symbol, label, name in zip(symbols, labels, own, strict=False):
+            k = table.column_names.index(label)
+            if pa.types.is_floating(table.schema.field(k).type):
+                factor = QUANTITIES[symbol].units.get(columns.unit(label, symbol), 1.0)
+                table = table.set_column(k, name, pa.array(factor * table.column(k).to_numpy()))
+                notes.append(f"{label} as {name}")
+    if notes:
+        warnings.warn(f"{path}: read {', '.join(notes)}", RepairWarning, stacklevel=4)
     return _on_the_floor(table)
 
 

@@ -311,9 +311,9 @@ def test_a_csv_of_a_spreadsheet_is_a_run_where_the_names_are(tmp_path):
 
 def test_a_csv_of_another_program_is_a_run_by_the_names_and_units_of_its_quantities(tmp_path):
     (tmp_path / "run.csv").write_text(
-        "time [ms],pos_x,pos_y,theta_deg,b_total_nt\n0,1,2,90,41000\n500,1,3,0,41001\n"
+        "t_ms,pos_x,pos_y,theta_deg,b_total_nt\n0,1,2,90,41000\n500,1,3,0,41001\n"
     )
-    with pytest.warns(RepairWarning, match="as p_world_base_x and p_world_base_y"):
+    with pytest.warns(RepairWarning, match="t_ms as t, pos_x as p_world_base_x"):
         run = read_csv(tmp_path / "run.csv")
     assert run["t"].tolist() == [0, 0.5]
     assert run["p_world_base"].tolist() == [[1, 2, 0], [1, 3, 0]]

@@ -131,7 +131,9 @@ def _placed(table: Table, told: Columns, taken: list[str]) -> Columns:
         text = f"{shown} are latitude and longitude; give x,y in metres in the axes of the lab"
         raise InputError(f"{table.path}: {text}")
     if not labels or not all(labels):
-        raise InputError(f"{table.path}: no column of x and of y {_seen(table)}; name both: --x NAME --y NAME")
+        raise InputError(
+            f"{table.path}: no column of x and of y {_seen(table)}; name both: --x NAME --y NAME"
+        )
     columns = replace(told, x=labels[0], y=labels[1])
     notes = table.taken({"x": columns.x, "y": columns.y})
     taken += [note for note in notes if "by the units" in note]
