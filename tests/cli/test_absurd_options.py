@@ -50,7 +50,12 @@ LOCALIZE = "localize run.npz --map lab --out new"
         (FIT, "--spacing-m", "1e-300", "widen --spacing-m"),
         (FIT, "--spacing-m", "inf", "--spacing-m must be above 0 m, got inf"),
         (FIT, "--headings-deg", ",".join(map(str, np.arange(0, 360, 0.1))), "--headings-deg names 3,600"),
-        (FIT, "--scale", "-1", "--scale: scale, the factor to nT, must be above 0"),
+        (
+            "map import survey.csv --out new.parquet",
+            "--scale",
+            "-1",
+            "--scale: scale, the factor to nT, must be above 0",
+        ),
         (FIT.replace("trilinear", "harmonic"), "--earth", "nan,0,0", "--earth: earth_nt must be three"),
         (SURVEY, "--readings", HUGE, "--readings must be at least 1 and at most 100,000"),
         (SURVEY, "--heading-error-deg", "1e300", "--heading-error-deg must be from 0 to 90 deg"),

@@ -412,10 +412,10 @@ def test_an_image_that_would_become_too_large_is_left_out_with_its_reason(write,
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before < MOST
 
 
-def _read_path(path):
-    from magtwin.path import read_path_csv
+def _read_card(path):
+    from magtwin.files.file import read_text
 
-    return read_path_csv(path)
+    return read_text(path, "model card", "text")
 
 
 def _read_readings(path):
@@ -438,7 +438,7 @@ LARGE = {
     "npz": ("a.npz", read_run),
     "Parquet": ("a.parquet", read_run),
     "CSV": ("a.csv", read_run),
-    "text": ("a.csv", _read_path),
+    "text": ("a.md", _read_card),
     "readings": ("a.csv", _read_readings),
     "recording": ("a.json", _read_recording),
     "rrd": ("a.rrd", read_run),

@@ -70,4 +70,7 @@ def earth_nt(text: str) -> tuple[float, float, float]:
     """The Earth's field of `--earth` [nT]."""
     from magtwin.author.earth import earth_of
 
-    return earth_of(text)
+    try:
+        return earth_of(text)
+    except InputError as error:
+        raise InputError(str(error), parameter="earth") from error
