@@ -212,9 +212,13 @@ def _read_layer(path: Path, heading_deg: float, unit: str, scale: float | None) 
     where = table.columns[0].where
     for role, column in values.items():
         if len(lost := np.flatnonzero(~np.isfinite(column))):
-            text = "every node needs a finite value, measure it or copy the file again"
+            (label,), row = labels[role], int(lost[0])
+            cell = str(table.column(label).cells[row]).strip()
             why = "".join(f"; {note}" for note in table.notes if "cut short" in note)
-            raise InputError(f"{where(int(lost[0]))}: {labels[role][0]} is missing; {text}{why}")
+            raise InputError(
+                f"{where(row)}: {label} is missing, got {cell!r}; every node needs a finite value, measure it or "
+                f"copy the file again{why}"
+            )
     field = nt_per(unit, scale) * values["field"]
     if len(low := np.flatnonzero(field <= 0)):
         text = f"scalar_mag is a magnitude, above 0 nT, got {field[low[0]]:g}"

@@ -183,7 +183,10 @@ REFUSALS = {
         (ROW2, "0.5,0.0,east,41200\n"),
         r"90_map\.csv:3: theta must be a finite number, got 'east'$",
     ),
-    "nan": ((ROW2, "0.5,0.0,1.57,nan\n"), r"90_map\.csv:3: scalar_mag is missing; every node needs"),
+    "nan": (
+        (ROW2, "0.5,0.0,1.57,nan\n"),
+        r"90_map\.csv:3: scalar_mag is missing, got 'nan'; every node needs",
+    ),
     "infinite": ((ROW2, "inf,0.0,1.57,41200\n"), r"90_map\.csv:3: x must be a finite number"),
     "negative magnitude": ((ROW2, "0.5,0.0,1.57,-41200\n"), r"90_map\.csv:3: scalar_mag is a magnitude"),
     "hole": ((ROW2, ""), r"90_map\.csv: 1 of 4 nodes have no row, the first at \(0\.5, 0\)"),
@@ -193,7 +196,7 @@ REFUSALS = {
     ),
     "cut short": (
         {"90_map.csv": HEADER + "".join(f"{k},0,1.57,4100{k}.5\n" for k in range(9)) + "9,0,1.57,41"},
-        r"90_map\.csv:11: scalar_mag is missing; .* its 41 is far below all other values",
+        r"90_map\.csv:11: scalar_mag is missing, .* its 41 is far below all other values",
     ),
     "another grid": (
         ("0.5,", "0.6,"),
