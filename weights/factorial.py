@@ -26,7 +26,7 @@ from rich.console import Console
 
 import magtwin as mt
 from magtwin.files.file import sha256, shipped
-from magtwin.io.surveys.maps import open_map
+from magtwin.io.map_files import open_map
 from magtwin.learn.data.dataset import open_dataset
 from magtwin.learn.evaluation.candidates import Candidate, candidate_of, naive, named_map
 

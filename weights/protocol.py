@@ -27,7 +27,7 @@ from rich.console import Console
 from magtwin.author.scene import author_scene
 from magtwin.cli import main as magtwin
 from magtwin.field.fit.fit import fit, raster
-from magtwin.field.survey.folder import read_survey
+from magtwin.field.survey.nodes import read_survey
 from magtwin.files.file import shipped
 from magtwin.files.settings import from_table, read_toml
 from magtwin.io.surveys.readings import read_readings

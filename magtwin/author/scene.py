@@ -10,7 +10,7 @@ from pxr import Kind, Sdf, Usd, UsdGeom, UsdUtils
 
 from magtwin.author.room import check_name
 from magtwin.errors import InputError
-from magtwin.field.maps.made_from import made_from
+from magtwin.field.maps.scene_state import made_from
 from magtwin.field.sources.magnets import body_of
 from magtwin.files.file import existing
 from magtwin.files.outputs import output

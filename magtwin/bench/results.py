@@ -31,10 +31,10 @@ from magtwin.errors import InputError, find
 from magtwin.files.file import read_text
 from magtwin.files.kinds import expected
 from magtwin.files.outputs import output
-from magtwin.io.tables import load_parquet
 from magtwin.localization.scores import Scores
 from magtwin.report.report import Figure, Report
 from magtwin.report.summary import Summarized, Summary, listed
+from magtwin.tables.parquet import load_parquet
 
 if TYPE_CHECKING:
     from magtwin.bench.leaderboard import Standing

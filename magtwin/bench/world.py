@@ -31,9 +31,9 @@ def fit_field(folder: Path, out: Path) -> None:
         out: Folder to write: truth.npz and nodes.npz.
     """
     from magtwin.field.fit.fit import fit, raster
-    from magtwin.io.surveys.maps import read_survey
+    from magtwin.io.surveys.survey import survey_and_report
 
-    readings = read_survey([folder])[0]
+    readings = survey_and_report([folder])[0]
     headings = np.linspace(0.0, 2 * np.pi, HEADINGS, endpoint=False)
     truth = raster(fit(readings, "harmonic"), readings, spacing_m=CELL_M, headings_rad=headings)
     nodes = raster(fit(readings, "trilinear"), readings)

@@ -46,10 +46,8 @@ BUDGETS: dict[str, Budget] = {
     "npz": Budget(count=10_000),
     "Parquet": Budget(count=10_000),
     "CSV": Budget(file=8 * GB, count=10_000),
-    "text": Budget(file=64 * MB),  # paths and commands, a few columns
-    "readings": Budget(
-        file=128 * MB
-    ),  # surveys of foreign CSV, whose words are texts before they are numbers
+    "text": Budget(file=64 * MB),  # model cards and curves of training
+    "readings": Budget(file=128 * MB),  # foreign tables, whose words are texts before they are numbers
     "recording": Budget(file=1 * GB),  # of the release, read frame by frame
     "rrd": Budget(),
     "bag": Budget(count=1 << 30),  # bytes of a chunk or message

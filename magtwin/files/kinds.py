@@ -71,7 +71,7 @@ BAG_YAML = Kind("the description of a bag", "give the folder that it is in")
 MESH = Kind("a mesh", "magtwin robot converts a URDF that names it")
 GAZEBO = Kind("a world or model of Gazebo", "give the URDF or the stage that it was made from")
 ARCHIVE = Kind("an archive", "unpack it, and give a file in it")
-TABLE = Kind("a table", "give its columns to magtwin map fit, or the file that it was made from")
+TABLE = Kind("a table", "give its columns to magtwin map import, or the file that it was made from")
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 

@@ -71,7 +71,7 @@ BAG = Format(
     name="rosbag2",
     read="magtwin.io.bags.reader:read_bag",
     write="magtwin.io.bags.writer:write_bag",
-    reads=frozenset(("topics", "unit", "scale")),
+    reads=frozenset(("topics", "unit", "scale", "survey")),
     takes=frozenset(("twin", "scans", "units")),
 )
 DB3 = Format(

@@ -8,7 +8,7 @@ from typing import Any
 
 from magtwin.errors import InputError, hint
 from magtwin.field.maps.statistics import map_metadata
-from magtwin.field.survey.folder import read_survey
+from magtwin.field.survey.nodes import read_survey
 from magtwin.files.file import existing
 from magtwin.files.kinds import kind_of, shipped_or
 from magtwin.io.formats import FORMATS, read_run

@@ -20,7 +20,7 @@ def open_map(file: Source) -> AnomalyMap:
     Raises:
         InputError: There is no map, or it is damaged.
     """
-    from magtwin.field.survey.folder import read_survey
+    from magtwin.field.survey.nodes import read_survey
     from magtwin.usd.maps.layer import load_map
 
     file = map_file(file)

@@ -9,8 +9,8 @@ import pyarrow.parquet as pq
 from magtwin.errors import InputError
 from magtwin.files.file import existing
 from magtwin.files.outputs import output
-from magtwin.io.tables import load_parquet
 from magtwin.sim.sensors.lidar import Scans
+from magtwin.tables.parquet import load_parquet
 
 _VECTORS = {"p_world_lidar": 3, "q_world_lidar_xyzw": 4}
 _DOCS = {

@@ -10,10 +10,11 @@ import math
 import os
 import shutil
 import struct
+import warnings
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from tokenize import TokenError
 from typing import IO, Any
@@ -23,7 +24,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError, find
+from magtwin.errors import InputError, RepairWarning, find
 from magtwin.files.budget import BUDGETS, check_count, check_decoded, check_size, decoded_limit
 from magtwin.files.file import check_zip, existing
 from magtwin.files.outputs import check_free, output
@@ -37,13 +38,17 @@ from magtwin.run.arrow import (
     spec_said,
     table_of,
 )
-from magtwin.run.parquet import check_parquet
 from magtwin.run.run import COLUMNS, Run, check_clock
 from magtwin.run.spool import Spool, blocks
+from magtwin.tables.parquet import load_parquet
+from magtwin.tables.quantities import QUANTITIES
+from magtwin.tables.table import Column, Table
 
-_MAGIC = b"PAR1"
 _ABOUT = "magtwin"
 """Name of the member of an npz with the metadata, and first word of a CSV."""
+
+_OWN = {("t",): ("t",), ("x", "y"): ("p_world_base_x", "p_world_base_y"), ("heading",): ("yaw",)}
+"""Columns of a Run that are known by the quantity that a table of another program names."""
 
 NUMBER = 8
 """Bytes of a number in memory."""
@@ -114,8 +119,8 @@ def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | N
             return _read_long(path, [path], columns)
         table = load_parquet(path)
         if columns:
-            table = _on_the_floor(table.rename_columns(_renamed(table.column_names, columns, path)))
-        return run_of(table, path)
+            table = table.rename_columns(_renamed(table.column_names, columns, path))
+        return run_of(table if FACTS in (table.schema.metadata or {}) else _by_quantity(table, path), path)
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: damaged Parquet (a name is no text); write it again") from error
 
@@ -157,38 +162,6 @@ def _read_long(path: Path, files: Sequence[Path], columns: Mapping[str, str] | N
     run = spool.run
     check_clock(run, str(path))
     return run
-
-
-def _whole(path: Path) -> pa.Table:
-    with pq.ParquetFile(path) as file:  # `read_table` would import pandas
-        return file.read()
-
-
-def load_parquet(path: Path, load: Callable[[Path], Any] = _whole) -> Any:
-    """A Parquet file, loaded by a function of pyarrow.
-
-    Raises:
-        InputError: It is no regular file, does not begin and end like Parquet, or is damaged.
-    """
-    path = existing(path, "Parquet file")
-    _check_file(path, "a Parquet file")
-    with open(path, "rb") as file:
-        head = file.read(4)
-        file.seek(max(0, path.stat().st_size - 4))
-        tail = file.read(4)
-    if head != _MAGIC:
-        raise InputError(f"{path}: not a Parquet file: it begins with {head!r}, not {_MAGIC!r}")
-    if tail != _MAGIC:
-        raise InputError(f"{path}: Parquet cut short: its end is missing; write it again, or copy it again")
-    try:
-        check_parquet(path)
-        loaded = load(path)
-        if isinstance(loaded, pa.Table):
-            loaded.validate(full=True)  # texts that are not UTF-8 fail later otherwise
-        return loaded
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        reason = (str(error).splitlines() or [""])[0]
-        raise InputError(f"{path}: damaged Parquet ({reason}); write it again") from error
 
 
 def _check_file(path: Path, kind: str) -> None:
@@ -338,7 +311,7 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
         )
     fields = [f.with_metadata(said.get(f.name) or None) for f in table.schema]
     table = table.cast(pa.schema(fields, metadata={FACTS: metadata}))
-    return run_of(_on_the_floor(table) if columns else table, path)
+    return run_of(table if said else _by_quantity(table, path), path)
 
 
 def _renamed(names: Sequence[str], columns: Mapping[str, str], path: Path) -> list[str]:
@@ -350,6 +323,23 @@ def _renamed(names: Sequence[str], columns: Mapping[str, str], path: Path) -> li
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
     return [own.get(name, name) for name in names]
+
+
+def _by_quantity(table: pa.Table, path: Path) -> pa.Table:
+    """A table of another program, with the names and units of a Run for what it names otherwise."""
+    notes = []
+    for symbols, own in _OWN.items():
+        columns = Table(tuple(Column(name, (), path, None) for name in table.column_names))
+        labels = [] if set(own) & set(table.column_names) else columns.find(*symbols)
+        for symbol, label, name in zip(symbols, labels, own, strict=False):
+            k = table.column_names.index(label)
+            if pa.types.is_floating(table.schema.field(k).type):
+                factor = QUANTITIES[symbol].units.get(columns.unit(label, symbol), 1.0)
+                table = table.set_column(k, name, pa.array(factor * table.column(k).to_numpy()))
+                notes.append(f"{label} as {name}")
+    if notes:
+        warnings.warn(f"{path}: read {', '.join(notes)}", RepairWarning, stacklevel=4)
+    return _on_the_floor(table)
 
 
 def _on_the_floor(table: pa.Table) -> pa.Table:

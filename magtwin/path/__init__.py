@@ -14,7 +14,6 @@ from magtwin.path.curves import (
     path,
     path_named,
     sine,
-    spline,
     split_lawnmower,
 )
 from magtwin.path.points import path_of_points, read_path_csv, resolve_path
@@ -44,6 +43,5 @@ __all__ = [
     "read_path_csv",
     "resolve_path",
     "sine",
-    "spline",
     "split_lawnmower",
 ]

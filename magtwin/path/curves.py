@@ -17,13 +17,12 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError
 from magtwin.extend import Registry
 from magtwin.path.polyline import Path
 
-MOST_POINTS = 1_000_000  # Most points of a path: 5 km of a spline, 16 MB
+MOST_POINTS = 1_000_000  # Most points of a path
 PATHS: Registry[Callable[..., Path]] = Registry("path", "paths")  # Functions that make paths, by name
 path = PATHS.register  # Decorator that gives a function a name in `PATHS`
 
@@ -247,35 +246,6 @@ def path_named(name: str) -> Path:
         UnknownNameError: There is no such path; the text has the nearest name.
     """
     return PATHS[CASES.get(name, name)]()
-
-
-def spline(p_xy: ArrayLike, *, closed: bool = False, spacing_m: float = 0.01, name: str = "spline") -> Path:
-    """A smooth curve through points: a cubic spline with continuous curvature over their chord length.
-
-    An open curve has no curvature at its ends (natural spline); a closed one is periodic.
-
-    Args:
-        p_xy: Points in world [m], shape (N, 2); neighbours must differ.
-        closed: Whether the curve continues from the last point to the first.
-        spacing_m: Approximate distance between points of the path [m].
-        name: Name of the path.
-
-    Raises:
-        InputError: There are fewer than three points, or `spacing_m` is not above 0 or makes too many.
-    """
-    from scipy.interpolate import CubicSpline  # takes half a second
-
-    if not (math.isfinite(spacing_m) and spacing_m > 0):
-        raise InputError(f"spacing_m of a spline must be above 0 m, got {spacing_m!r}")
-    chords = Path(name, np.asarray(p_xy, float), closed)
-    if len(chords.p_xy) < 3 + closed:
-        raise InputError(f"path {name!r}: a spline needs three points that differ, got {len(chords.p_xy)}")
-    curve = CubicSpline(chords.s, chords.p_xy, bc_type="periodic" if closed else "natural")
-    points = chords.length / spacing_m + 1
-    _check_points(name, points, f"spacing_m {spacing_m:g} m over {chords.length:g} m")
-    count = max(len(chords.s), math.ceil(points))
-    s = np.union1d(np.linspace(0.0, chords.length, count), chords.s)
-    return Path(name, curve(s), closed)
 
 
 def _check_points(name: str, points: float, what: str) -> None:

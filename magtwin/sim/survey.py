@@ -13,8 +13,8 @@ from magtwin.errors import InputError
 from magtwin.field.grid import Grid
 from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.holes import filled
-from magtwin.field.maps.made_from import made_from
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.scene_state import made_from
 from magtwin.field.survey.readings import Readings
 from magtwin.frames import quat_conjugate, quat_from_yaw, rotate
 from magtwin.parallel import run_all

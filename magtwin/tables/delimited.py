@@ -1,21 +1,24 @@
 """Delimited text: rows of words in a file of another program, such as a spreadsheet or a script.
 
-Separator and header are found from the text. `notes` has what was repaired: lines above the header, headers
-that are repeated, decimal commas, marks between thousands, and a last line that was cut short.
+Encoding, separator and header are found from the text. `notes` has what was repaired: lines above the header,
+headers that are repeated, decimal commas, and a last line that was cut short.
 """
 
+import codecs
 import csv
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from magtwin.errors import InputError
 from magtwin.files.budget import check_size
 from magtwin.files.file import existing
+from magtwin.tables.labels import meaning_of, split_label
+from magtwin.tables.quantities import UNITS
 
 LONGEST_LINE = 65_536
 """Longest line [characters]."""
@@ -39,38 +42,10 @@ MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "*", "#na", "#nv",
 """Words for a missing value, in lower case; `*` is that of Geosoft. Spreadsheets also write errors for them,
 such as #DIV/0!."""
 
-LENGTHS = {
-    **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
-    "cm": 0.01,
-    "mm": 0.001,
-    "km": 1e3,
-    "ft": 0.3048,
-}
-"""Metres per unit of length, by the unit in a header."""
-
-PLACED = ("x", "y", "heading", "yaw", "theta")
-"""Names of columns of poses."""
-
-DEGREES = ("deg", "degree", "degrees", "\N{DEGREE SIGN}", "\N{MASCULINE ORDINAL INDICATOR}")
-"""Names of the degree in a header."""
-
-UNITS = frozenset(
-    {*LENGTHS, *DEGREES, "rad", "radian", "radians", "s", "sec", "second", "seconds", "ms", "us", "ns", "min"}
-    | {"nt", "ut", "mt", "t", "mg", "g", "gauss", "tesla", "nanotesla", "microtesla", "m/s", "rad/s", "deg/s"}
-)
-"""Units, in lower case, that tell a row of units below the header."""
-
 _NUMBER = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
 _COMMA = re.compile(r"\s*[+-]?(\d{1,3}(\.\d{3})+|\d*),\d+([eE][+-]?\d+)?\s*", re.ASCII)
 """A number with a decimal comma, and perhaps with points between its thousands."""
 
-_THOUSANDS = re.compile(
-    r"\s*[+-]?[1-9]\d{0,2}(?P<mark>[,'\u2019 \u00a0\u202f])\d{3}((?P=mark)\d{3})*(?P<rest>[.,]\d*)?\s*",
-    re.ASCII,
-)
-"""A number with marks between its thousands: English commas, Swiss apostrophes or French blanks."""
-
-_BELOW_1000 = re.compile(r"\s*[+-]?\d{1,3}([.,]\d*)?\s*", re.ASCII)
 _BEGUN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d*)?([eE][+-]?)?", re.ASCII)
 """The begin of a number."""
 
@@ -84,9 +59,20 @@ _REMARK = re.compile(r"\s*#\s*\w+:\s")
 """A comment line `# KEY: VALUE`, as in maps written as CSV."""
 
 _ERROR = re.compile(r"\s*#(n/?a|nv|value!|div/0!|ref!|num!|name\?|null!)\s*", re.IGNORECASE)
-_BRACKETS = re.compile(r"[\[\]()]")
+_CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f]")
+"""Characters that no text has."""
+
 _Lines = list[tuple[int, str]]
 """Number and text of lines."""
+
+_Rows = list[tuple[int, list[str]]]
+"""Line and words of rows."""
+
+
+_PLACED = ("x", "y", "heading")
+"""Quantities one of which a header names, if prose above it looks like another header."""
+
+_UNITS = frozenset(unit.replace("_", "") for unit in UNITS)
 
 
 @dataclass(frozen=True)
@@ -108,41 +94,27 @@ class Delimited:
     notes: tuple[str, ...] = ()
     """What was repaired."""
 
-    @property
-    def width(self) -> int:
-        """Number of columns."""
-        return len(self.names or self.rows[0])
-
-    def named(self) -> "Delimited":
-        """Without the columns that have no name beside others that have one, such as the index of pandas."""
-        keep = [k for k, name in enumerate(self.names) if name and not name.startswith("Unnamed: ")]
-        if not keep or len(keep) == self.width:
-            return self
-        names = tuple(self.names[k] for k in keep)
-        return replace(self, names=names, rows=[[row[k] for k in keep] for row in self.rows])
+    comments: tuple[tuple[int, str], ...] = ()
+    """Number and text of the lines that begin with `#`."""
 
 
-def read_delimited(
-    path: str | os.PathLike[str], noun: str, kind: str, wanted: str, *, units: bool = False
-) -> Delimited:
+def read_delimited(path: str | os.PathLike[str], noun: str, wanted: str) -> Delimited:
     """Read a text file of rows whose words are separated by commas, semicolons, tabs or blanks.
 
-    The header is the first line if any of its words is not a number, else the last comment line above the
-    rows with as many words as they have. These are skipped: other lines that begin with `#`, such as
-    `# KEY: VALUE`; those that begin with `/` if the first line does; empty lines; a first line `sep=;`; lines
-    of prose above the header and one below the rows; headers that are repeated; and the lines `Line 10` and
-    `Tie 3` of Geosoft. A decimal comma is read unless commas separate the words or other numbers have decimal
-    points. Marks between thousands are read if all numbers of the column fit. If the last line has no end, it
-    is left out if it has fewer words than others; its last number is missing if it is far below all others of
-    its column.
+    The text is UTF-8, UTF-16 with its mark, or cp1252, which older spreadsheets write. The header is the
+    first line if any of its words is not a number, else the last comment line above the rows with as many
+    words as they have. These are skipped: other lines that begin with `#`, such as `# KEY: VALUE`; those that
+    begin with `/` if the first line does; empty lines; a first line `sep=;`; lines of prose above the header
+    and one below the rows; headers that are repeated; and the lines `Line 10` and `Tie 3` of Geosoft. The
+    units in a row below the header are added to the names, as in `x [cm]`. A decimal comma is read unless
+    commas separate the words or other numbers have decimal points. If the last line has no end, it is left
+    out if it has fewer words than others; its last number is missing if it is far below all others of its
+    column.
 
     Args:
         path: The file.
         noun: What it is, for error messages.
-        kind: Format in `magtwin.files.budget.BUDGETS`.
         wanted: What a row holds, for error messages ("one row of numbers per reading").
-        units: Add the units in a row below the header to the names, as in `x [cm]`. By default, such a row is
-            one of the rows.
 
     Raises:
         InputError: The file is missing, not text, or empty, or its lines are too long or of different widths.
@@ -150,68 +122,35 @@ def read_delimited(
     path = existing(path, noun)
     if path.is_dir():
         raise InputError(f"{path}: cannot be read (a folder); expected a {noun}")
-    check_size(path, kind)
-    lines = list(_lines(path, noun))
-    told = re.fullmatch(r'"?sep=(.)"?', lines[0][1].strip(" \r\n"), re.IGNORECASE) if lines else None
-    above, lines, notes = _without_comments(lines[1:] if told else lines)
+    check_size(path, "readings")
+    notes = list[str]()
+    lines, ended = _lines(path, _decoded(path, noun, notes))
+    comments, above, lines, told = _without_comments(lines, notes)
     if not lines:
         raise InputError(f"{path}: empty; expected {wanted}")
-    ended = lines[-1][1].endswith("\n")
-    lines = [(number, line.rstrip("\n")) for number, line in lines]
-    between, prose = (told[1], 0) if told and told[1] != " " else _separator(lines)
+    between, prose = (told, 0) if told else _separator(lines)
     if not ended and between and lines[-1][1].count('"') % 2:
         lines[-1] = (lines[-1][0], lines[-1][1] + '"')
-    lines = lines[prose:]
-    rows = _words(path, lines, between)
+    rows = _words(path, lines[prose:], between)
     first = _header(rows)
     if prose or first:
-        notes.append(f"line {lines[first][0]} as the header, and the lines above it as prose")
-    rows, numbers = rows[first:], [number for number, _ in lines[first:]]
-    names: list[str] = []
-    if _is_header(rows[0]):
-        names = [word.strip() for word in rows[0]]
-        rows, numbers = rows[1:], numbers[1:]
-    else:
-        for comment in above:
-            with suppress(InputError):  # prose with unpaired quotes
-                (header,) = _words(path, [comment], between)
-                names = [word.strip() for word in header] if len(header) == len(rows[0]) else names
+        notes.append(f"line {rows[first][0]} as the header, and the lines above it as prose")
+    names, rows = _names(path, rows[first:], above, between)
     if not rows:
         raise InputError(f"{path}: no rows below the header; expected {wanted}")
-    width = len(names) or len(rows[0])
+    width = len(names) or len(rows[0][1])
     if why := _last(rows, width, ended, between is None):
-        notes.append(f"line {numbers[-1]} {why}")
-        rows, numbers = rows[:-1], numbers[:-1]
-    headers = [names]
-    if units and names and _is_units(rows[:2], width):
-        notes.append(f"line {numbers[0]} as the units of the columns")
-        headers.append([word.strip() for word in rows[0]])
-        names = [_with_unit(name, word) for name, word in zip(names, rows[0], strict=True)]
-        rows, numbers = rows[1:], numbers[1:]
-    repeated = {k for k, row in enumerate(rows) if names and any(_is_same(row, header) for header in headers)}
-    if 0 < len(repeated) < len(rows):
-        notes.append(f"lines that repeat the header left out: {len(repeated)}")
-        numbers = [number for k, number in enumerate(numbers) if k not in repeated]
-        rows = [row for k, row in enumerate(rows) if k not in repeated]
-    for number, row in zip(numbers, rows, strict=True):
+        notes.append(f"line {rows[-1][0]} {why}")
+        rows = rows[:-1]
+    names, rows = _without_headers(names, rows, notes)
+    for number, row in rows:
         if len(row) != width:
             raise InputError(f"{path}:{number}: {width} values expected, got {len(row)}")
-    if columns := _without_thousands(rows):
-        named = ", ".join(names[k] if names else str(k + 1) for k in columns)
-        notes.append(f"numbers of {named[:QUOTED]} with marks between thousands")
-    if between != ",":
-        rows, some = _with_points(rows)
-        notes += ["numbers with decimal commas"] if some else []
-    if not ended and numbers[-1] == lines[-1][0]:
-        last = rows[-1][-1].strip()
-        begun = len(rows) > 1 and _is_text(last) and _BEGUN.fullmatch(last) and _is_number(rows[-2][-1])
-        if begun or is_cut_short([row[-1] for row in rows]):
-            why = "begins a number" if begun else "is far below all other values"
-            notes.append(
-                f"line {numbers[-1]} as cut short and left out: it has no end, and its {last[:QUOTED]} {why}"
-            )
-            rows[-1][-1] = ""
-    return Delimited(path, tuple(names), rows, numbers, tuple(notes))
+    words = [row for _, row in rows]
+    _plain_numbers(names, words, between, notes)
+    if not ended and rows[-1][0] == lines[-1][0]:
+        _without_begun(rows[-1][0], words, notes)
+    return Delimited(path, tuple(names), words, [number for number, _ in rows], tuple(notes), tuple(comments))
 
 
 def number_of(word: str) -> float:
@@ -222,7 +161,7 @@ def number_of(word: str) -> float:
     return math.nan if word.strip().lower() in MISSING or _ERROR.fullmatch(word) else -math.inf
 
 
-def is_cut_short(column: Sequence[str]) -> bool:
+def _is_cut_short(column: Sequence[str]) -> bool:
     """Whether the last number of a column has lost its end: it is shorter and far less than all others."""
     *others, last = column
     if len(others) < LEAST_ROWS or not math.isfinite(value := number_of(last)):
@@ -232,29 +171,9 @@ def is_cut_short(column: Sequence[str]) -> bool:
     return LOST * abs(value) < min((abs(v) for v in map(number_of, others) if math.isfinite(v)), default=0.0)
 
 
-def label_of(text: str) -> tuple[str, str]:
-    """Name and unit in the header of a column, in lower case: `X [cm]`, `x (cm)` and `x_cm` are x in cm.
-
-    The unit is "" if there is none. It is read after a low line only for the names in `PLACED`.
-    """
-    text = text.strip().lower()
-    if (name := bare(text)) != text:
-        return name, text[len(name) :].strip()[1:-1].strip()
-    name, _, unit = text.rpartition("_")
-    return (name, unit) if name in PLACED and unit in (*LENGTHS, *DEGREES, "rad") else (text, "")
-
-
-def bare(label: str) -> str:
-    """The name of a column without its unit in brackets."""
-    label = label.strip()
-    at = max(label.rfind("["), label.rfind("("))
-    has_unit = at >= 0 and label.endswith(("]", ")")) and len(_BRACKETS.findall(label, at)) == 2
-    return label[:at].rstrip() if has_unit else label
-
-
 def _is_number(word: str) -> bool:
-    """Whether a word is a number, perhaps with a decimal comma or marks between thousands."""
-    return math.isfinite(number_of(word)) or bool(_COMMA.fullmatch(word) or _THOUSANDS.fullmatch(word))
+    """Whether a word is a number, perhaps with a decimal comma."""
+    return math.isfinite(number_of(word)) or bool(_COMMA.fullmatch(word))
 
 
 def _is_text(word: str) -> bool:
@@ -264,21 +183,19 @@ def _is_text(word: str) -> bool:
 
 def _is_header(words: list[str]) -> bool:
     """Whether a word of the first row is not a number, and none is one with a comma."""
-    return any(map(_is_text, words)) and not any(
-        _COMMA.fullmatch(w) or _THOUSANDS.fullmatch(w) for w in words
-    )
+    return any(map(_is_text, words)) and not any(_COMMA.fullmatch(w) for w in words)
 
 
-def _header(rows: list[list[str]]) -> int:
+def _header(rows: _Rows) -> int:
     """Index of the header, below prose that a spreadsheet has filled to the width of the table.
 
     It is the last row of distinct texts, one for each column, above the first row that is mostly numbers;
     rather one that names a column of poses.
     """
-    head = rows[: MOST_ABOVE + 3]  # with a row of units and one of numbers
+    head = [row for _, row in rows[: MOST_ABOVE + 3]]  # with a row of units and one of numbers
     full = next((k for k, row in enumerate(head) if 2 * sum(map(_is_number, row)) > len(row)), 0)
     likely = [k for k, row in enumerate(head[:full]) if _is_names(row, head[full])]
-    placed = [k for k in likely if any(label_of(word)[0] in PLACED for word in head[k])]
+    placed = [k for k in likely if any(meaning_of(word, role) for word in head[k] for role in _PLACED)]
     found = (placed or likely or [0])[-1]
     prose = all(any(map(_is_text, row)) or not any(map(str.strip, row)) for row in head[:found])
     return found if prose and found <= MOST_ABOVE else 0
@@ -292,21 +209,51 @@ def _is_names(row: list[str], below: list[str]) -> bool:
     return all(map(_is_text, texts)) and len(set(texts)) == len(texts)
 
 
-def _last(rows: list[list[str]], width: int, ended: bool, blanks: bool) -> str:
+def _last(rows: _Rows, width: int, ended: bool, blanks: bool) -> str:
     """Why the last row is left out: it was cut short, or is prose such as `END OF FILE`; "" if it is not."""
-    if len(rows) < 2 or len(rows[-2]) != width:
+    if len(rows) < 2 or len(rows[-2][1]) != width:
         return ""
-    row, words = rows[-1], [word for word in rows[-1] if word.strip()]
+    row = rows[-1][1]
+    words = [word for word in row if word.strip()]
     if not ended and len(row) < width:
         return f"as cut short and left out: it has no end, and {len(row)} of {width} values"
     alone = width > 1 and (blanks or len(words) == 1) and all(map(_is_text, words))
-    below = len(row) != width or _is_number(rows[-2][0])
+    below = len(row) != width or _is_number(rows[-2][1][0])
     return f"as prose and left out: {' '.join(words)[:QUOTED]!r}" if alone and below else ""
 
 
 def _is_unit(word: str) -> bool:
-    unit = _BRACKETS.sub("", word).strip().lower()
-    return unit.replace("\N{MICRO SIGN}", "u").replace("\N{GREEK SMALL LETTER MU}", "u") in UNITS
+    return split_label(f"x [{word.strip(' []()')}]").unit.replace("_", "") in _UNITS
+
+
+def _names(path: Path, rows: _Rows, above: _Lines, between: str | None) -> tuple[list[str], _Rows]:
+    """Names of the columns, from the first row or from a comment above the rows; and the other rows."""
+    if _is_header(rows[0][1]):
+        return [word.strip() for word in rows[0][1]], rows[1:]
+    names: list[str] = []
+    for comment in above:
+        with suppress(InputError):  # prose with unpaired quotes
+            ((_, header),) = _words(path, [comment], between)
+            names = [word.strip() for word in header] if len(header) == len(rows[0][1]) else names
+    return names, rows
+
+
+def _without_headers(names: list[str], rows: _Rows, notes: list[str]) -> tuple[list[str], _Rows]:
+    """Names with the units of a row below them, and the rows without headers that are repeated."""
+    if not names:
+        return names, rows
+    headers = [names]
+    if _is_units([row for _, row in rows[:2]], len(names)):
+        number, units = rows[0]
+        notes.append(f"line {number} as the units of the columns")
+        headers.append([word.strip() for word in units])
+        names = [_with_unit(name, word) for name, word in zip(names, units, strict=True)]
+        rows = rows[1:]
+    others = [row for row in rows if [word.strip() for word in row[1]] not in headers]
+    if 0 < len(others) < len(rows):
+        notes.append(f"lines that repeat the header left out: {len(rows) - len(others)}")
+        rows = others
+    return names, rows
 
 
 def _is_units(rows: list[list[str]], width: int) -> bool:
@@ -318,12 +265,31 @@ def _is_units(rows: list[list[str]], width: int) -> bool:
 
 def _with_unit(name: str, word: str) -> str:
     """The name of a column with its unit, unless it has one or the word is missing."""
-    unit = _BRACKETS.sub("", word).strip()
-    return f"{name} [{unit}]" if name and _is_text(unit) and not label_of(name)[1] else name
+    unit = word.strip(" []()")
+    has_unit = bool(split_label(name).unit) or any(
+        meaning.unit for role in _PLACED if (meaning := meaning_of(name, role))
+    )
+    return f"{name} [{unit}]" if name and _is_text(unit) and not has_unit else name
 
 
-def _is_same(row: list[str], header: list[str]) -> bool:
-    return row[0].strip() == header[0] and [word.strip() for word in row] == header
+def _without_comments(lines: _Lines, notes: list[str]) -> tuple[_Lines, _Lines, _Lines, str]:
+    """Comments, those above the rows that may be a header, other lines, and the mark of a line `sep=;`."""
+    match = re.fullmatch(r'"?sep=(\S)"?', lines[0][1].strip(), re.IGNORECASE) if lines else None
+    lines = lines[1:] if match else lines
+    slashed = bool(lines) and bool(_SLASH.match(lines[0][1]))
+    others = [(number, line) for number, line in lines if not _is_comment(line, slashed)]
+    first = others[0][0] if others else math.inf
+    above = [
+        (number, text.lstrip(text[0]))
+        for number, text in ((number, line.strip()) for number, line in lines if number < first)
+        if re.search(r"\w", text) and not _REMARK.match(text)
+    ]
+    comments = [row for row in lines if row[1].lstrip().startswith("#") and _is_comment(row[1])]
+    tracks = [line.strip() for _, line in others if _TRACK.fullmatch(line)]
+    if tracks:
+        notes.append(f"lines such as {tracks[0][:QUOTED]!r} left out: {len(tracks)}")
+        others = [(number, line) for number, line in others if not _TRACK.fullmatch(line)]
+    return comments, above, others, match[1] if match else ""
 
 
 def _is_comment(line: str, slashed: bool = False) -> bool:
@@ -334,38 +300,29 @@ def _is_comment(line: str, slashed: bool = False) -> bool:
     return begun.startswith("#") and not _ERROR.fullmatch(re.split(r"[,;\t]", line, maxsplit=1)[0])
 
 
-def _without_comments(lines: _Lines) -> tuple[_Lines, _Lines, list[str]]:
-    """Comments above the rows that may be a header, the other lines, and what was left out."""
-    slashed = bool(lines) and bool(_SLASH.match(lines[0][1]))
-    others = [(number, line) for number, line in lines if not _is_comment(line, slashed)]
-    first = others[0][0] if others else math.inf
-    above = [
-        (number, text.lstrip(text[0]))
-        for number, text in ((number, line.strip()) for number, line in lines if number < first)
-        if re.search(r"\w", text) and not _REMARK.match(text)
-    ]
-    tracks = [line.strip() for _, line in others if _TRACK.fullmatch(line)]
-    if not tracks:
-        return above, others, []
-    note = f"lines such as {tracks[0][:QUOTED]!r} left out: {len(tracks)}"
-    return above, [(number, line) for number, line in others if not _TRACK.fullmatch(line)], [note]
+def _decoded(path: Path, noun: str, notes: list[str]) -> str:
+    """The text of a file."""
+    content = path.read_bytes()
+    encoding = "utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
+    try:
+        text = content.decode(encoding)
+    except UnicodeDecodeError:
+        text = content.decode("cp1252", "replace")
+        notes.append("text in cp1252")
+    if _CONTROL.search(text):
+        raise InputError(f"{path}: not a text file; a {noun} is CSV in UTF-8")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _lines(path: Path, noun: str) -> Iterator[tuple[int, str]]:
-    """Number and text of every nonblank line, with its end."""
-    with open(path, encoding="utf-8-sig", newline=None) as file:
-        number = 0
-        try:
-            while line := file.readline(LONGEST_LINE + 1):
-                number += 1
-                if len(line) > LONGEST_LINE:
-                    raise InputError(
-                        f"{path}:{number}: longer than {LONGEST_LINE:,} characters; this is no row of numbers"
-                    )
-                if line.strip():
-                    yield number, line
-        except UnicodeDecodeError as error:
-            raise InputError(f"{path}: not a text file ({error}); a {noun} is CSV in UTF-8") from error
+def _lines(path: Path, text: str) -> tuple[_Lines, bool]:
+    """Number and text of every nonblank line, and whether the last one has an end."""
+    lines = list(enumerate(text.split("\n"), 1))
+    for number, line in lines:
+        if len(line) > LONGEST_LINE:
+            raise InputError(
+                f"{path}:{number}: longer than {LONGEST_LINE:,} characters; this is no row of numbers"
+            )
+    return [(number, line) for number, line in lines if line.strip()], not lines[-1][1].strip()
 
 
 def _separator(lines: _Lines) -> tuple[str | None, int]:
@@ -404,55 +361,34 @@ def _above(lines: Sequence[str], mark: str) -> int | None:
     return above if same and (above == 0 or above <= min(MOST_ABOVE, len(lines) - 2)) else None
 
 
-def _words(path: Path, lines: _Lines, between: str | None) -> list[list[str]]:
+def _words(path: Path, lines: _Lines, between: str | None) -> _Rows:
     if between is None:
-        return [line.split() for _, line in lines]
+        return [(number, line.split()) for number, line in lines]
     rows = []
     for number, line in lines:
         try:
-            rows.append(next(csv.reader([line], delimiter=between, strict=True)))
+            rows.append((number, next(csv.reader([line], delimiter=between, strict=True))))
         except csv.Error as error:
             raise InputError(f"{path}:{number}: not CSV: {error}, in {line[:QUOTED]!r}") from None
     return rows
 
 
-def _without_thousands(rows: list[list[str]]) -> list[int]:
-    """Take the marks between thousands out of the columns all of whose numbers fit; returns these columns.
-
-    A comma may be a decimal one. It is between thousands if a number has a point after it, or two of them.
-    """
-    found = {
-        k: match["mark"]
-        for row in rows
-        for k, word in enumerate(row)
-        if len(word) > 4 and (match := _THOUSANDS.fullmatch(word))
-    }
-    columns = []
-    for k, mark in found.items():
-        words = [row[k] for row in rows]
-        matches = [_THOUSANDS.fullmatch(word) for word in words]
-        fits = all(
-            match["mark"] == mark
-            if match
-            else math.isnan(number_of(word)) or (mark not in word.strip() and _BELOW_1000.fullmatch(word))
-            for word, match in zip(words, matches, strict=True)
-        )
-        ends = {match["rest"][0] for match in matches if match and match["rest"]}
-        sure = mark != "," or "." in ends or any(word.count(mark) > 1 for word in words)
-        if fits and sure and mark not in ends:
-            columns.append(k)
-            for row in rows:
-                row[k] = row[k].strip().replace(mark, "")
-    return columns
-
-
-def _with_points(rows: list[list[str]]) -> tuple[list[list[str]], bool]:
-    """Rows whose decimal commas are points, unless numbers have both; and whether there are any."""
-    if not any(_COMMA.fullmatch(word) for row in rows for word in row if "," in word):
-        return rows, False
+def _plain_numbers(names: list[str], rows: list[list[str]], between: str | None, notes: list[str]) -> None:
+    """Make decimal commas points, unless commas separate the words or other numbers have points."""
+    if between == "," or not any(_COMMA.fullmatch(word) for row in rows for word in row if "," in word):
+        return
     if any(_NUMBER.fullmatch(word) for row in rows for word in row if "." in word):
-        return rows, False
-    return [
-        [word.replace(".", "").replace(",", ".") if _COMMA.fullmatch(word) else word for word in row]
-        for row in rows
-    ], True
+        return
+    notes.append("numbers with decimal commas")
+    for row in rows:
+        row[:] = [w.replace(".", "").replace(",", ".") if _COMMA.fullmatch(w) else w for w in row]
+
+
+def _without_begun(number: int, rows: list[list[str]], notes: list[str]) -> None:
+    """Take out the last number of a last line without an end, if it lost its own end."""
+    last = rows[-1][-1].strip()
+    begun = len(rows) > 1 and _is_text(last) and _BEGUN.fullmatch(last) and _is_number(rows[-2][-1])
+    if begun or _is_cut_short([row[-1] for row in rows]):
+        why = "begins a number" if begun else "is far below all other values"
+        notes.append(f"line {number} as cut short and left out: it has no end, and its {last[:QUOTED]} {why}")
+        rows[-1][-1] = ""

@@ -13,6 +13,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.scene_state import changes_since
 from magtwin.files.outputs import transaction
 from magtwin.frames import yaw_from_quat
 from magtwin.spec.magnetics import EarthFieldSpec
@@ -199,7 +200,7 @@ def open_scene(
         anomaly_map,
         lab=where.path if several else "",
         pose=None if pose == AT_ORIGIN else pose,
-        changes=() if made is None else tuple(made.changes(scene)),
+        changes=() if made is None else tuple(changes_since(made, scene)),
         notes=tuple(notes),
     )
 

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.field.fit.fit import fit, raster
-from magtwin.field.maps.made_from import made_from
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.scene_state import made_from
 from magtwin.field.survey.readings import Readings
 from magtwin.files.file import shipped
 from magtwin.files.outputs import output

@@ -38,7 +38,7 @@ def real_run(real_data, tmp_path_factory):
 def test_the_map_column_is_what_scipy_interpolates_and_unknown_beside_latched_nodes(real_run):
     from scipy.interpolate import RegularGridInterpolator
 
-    from magtwin.field.survey.folder import read_survey
+    from magtwin.field.survey.nodes import read_survey
 
     run, real = real_run
     tables = [np.loadtxt(real / "maps" / f"{h}_map.csv", delimiter=",") for h in (0, 90, 180, 270)]

@@ -10,7 +10,7 @@ import pytest
 from magtwin.cli import main
 from magtwin.field.grid import Grid
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.maps.statistics import map_metadata, source_files
+from magtwin.field.maps.statistics import source_files
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.usd.maps.layer import load_map, save_map
 
@@ -101,29 +101,6 @@ def test_info_tells_everything_that_a_map_knows(layer, capsys):
         assert part in text
 
 
-def test_info_says_what_is_unknown():
-    bare = AnomalyMap(
-        values_nt=np.full((1, 2, 2), 4e4),
-        origin_m=(0, 0),
-        cell_m=(1, 1),
-        headings_rad=[0.0],
-        source="by hand",
-    )
-    card = map_metadata(bare)
-    figures = {f.name: f.value for f in card.figures}
-    assert figures["standard deviation"] == figures["height"] == "unknown"
-    assert [card.metadata[n] for n in ("method", "frame", "datum", "created", "licence")] == ["unknown"] * 5
-    assert card.metadata["source"] == "by hand"
-    assert "dipoles" not in figures
-    assert map_metadata(replace(bare, source="")).metadata["source"] == "unknown"
-
-
-def test_info_works_on_a_stage_that_holds_a_map(lab_scene, capsys):
-    said = told(capsys, "map", "info", lab_scene)
-    assert said["title"] == "map lab"
-    assert said["figures"]["valid share"]["value"] == 100
-
-
 def test_info_works_on_a_folder_of_csvs_and_tells_their_checksums(real_data, capsys):
     from magtwin.files.file import sha256
 
@@ -136,12 +113,6 @@ def test_info_works_on_a_folder_of_csvs_and_tells_their_checksums(real_data, cap
 @pytest.mark.parametrize("source", ["", "a.csv", f"a.csv sha256:{SHA[:-1]}", f"a.csv sha256:{SHA}; by hand"])
 def test_a_source_that_is_not_all_files_with_checksums_names_none(source):
     assert source_files(source) == {}
-
-
-def test_files_of_one_name_that_differ_are_all_told():
-    other = SHA[::-1].replace("a", "b")
-    source = f"lab.usda sha256:{SHA}; room.usda sha256:{SHA}; lab.usda sha256:{other}; room.usda sha256:{SHA}"
-    assert source_files(source) == {"lab.usda": SHA, "room.usda": SHA, "lab.usda (2)": other}
 
 
 def test_continue_writes_the_map_of_another_height(tmp_path, layer, capsys):
@@ -187,41 +158,12 @@ def test_plot_draws_each_quantity_as_png_and_svg(tmp_path, layer, capsys, what):
         assert out.read_bytes().startswith(head)
 
 
-def test_plot_shows_the_headings_that_are_asked_for(tmp_path, layer):
-    main(["map", "plot", str(layer), "--out", str(tmp_path / "a.svg"), "--headings-deg", "45"])
-    words = " ".join(ElementTree.parse(tmp_path / "a.svg").getroot().itertext())
-    assert "heading 45°" in words
-    assert "heading 0°" not in words
-    assert "2026-01-01" in words
-
-
-def test_a_map_in_many_headings_is_drawn_in_four_unless_asked(tmp_path):
-    from magtwin.figures.canvas import save
-    from magtwin.figures.maps import draw_map
-
-    headings = np.radians(np.arange(0, 360, 15.0))
-    values = np.repeat(a_map().values_nt[:1], 24, axis=0)
-    field = AnomalyMap(values_nt=values, origin_m=(-2, -1.5), cell_m=(0.5, 0.5), headings_rad=headings)
-    save(draw_map(field), tmp_path / "a.svg")
-    words = " ".join(ElementTree.parse(tmp_path / "a.svg").getroot().itertext())
-    assert [h for h in range(0, 360, 15) if f"heading {h}°" in words] == [0, 90, 180, 270]
-
-
 def test_a_picture_of_another_kind_is_refused_before_anything_is_read(tmp_path, capsys):
     said = refused(capsys, "map", "plot", tmp_path / "gone.usdc", "--out", tmp_path / "a.jpg")
     assert "a picture ends in .png or .svg" in said
     assert "no such map" in refused(
         capsys, "map", "plot", tmp_path / "gone.usdc", "--out", tmp_path / "a.png"
     )
-
-
-def test_info_fits_80_columns_with_each_checksum_whole_on_a_line(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    save_map(a_map(), tmp_path / "m.usdc")
-    main(["map", "info", str(tmp_path / "m.usdc")])
-    lines = capsys.readouterr().out.splitlines()
-    assert max(map(len, lines)) <= 80
-    assert all(any(checksum in line for line in lines) for checksum in (SHA, SHA[::-1]))
 
 
 def test_a_maps_own_texts_do_not_steer_the_terminal(tmp_path, capsys):

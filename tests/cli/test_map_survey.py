@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from magtwin.cli import main
+from magtwin.field.survey.saved import load_readings
 from magtwin.files.file import sha256
-from magtwin.io.surveys.readings import load_readings
 from magtwin.usd.maps.layer import load_map
 
 

@@ -53,7 +53,7 @@ def test_an_option_has_one_meaning():
         "--pace": {"run", "film", "ros sim"},
         "--topic": {"ros record"},
         "--profile": {"robot"},
-        "--name": {"map import", "map fit", "map survey"},
+        "--name": {"map import", "map survey"},
         "--robot": {"run"},
         "--against": {"validate"},
         "--align": {"compare"},

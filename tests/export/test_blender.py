@@ -16,7 +16,7 @@ from pxr import Usd
 from magtwin.author.scene import author_scene
 from magtwin.author.scene_file import scene_from_toml
 from magtwin.export.package import export_scene
-from magtwin.field.survey.folder import read_survey
+from magtwin.field.survey.nodes import read_survey
 from magtwin.files.file import shipped
 from magtwin.spec.lab import LabSpec
 from magtwin.urdf.convert import convert_urdf

@@ -24,7 +24,7 @@ from magtwin.author.scene_file import scene_from_toml
 from magtwin.export.package import PLUGIN, README, export_scene, licence_of
 from magtwin.export.usdz import ALIGNMENT, ALLOWED
 from magtwin.export.validation.validate import validate
-from magtwin.field.survey.folder import read_survey
+from magtwin.field.survey.nodes import read_survey
 from magtwin.files.file import sha256, shipped
 from magtwin.run.run import Run
 from magtwin.usd.animation import read_animation

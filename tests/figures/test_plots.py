@@ -222,7 +222,7 @@ def test_what_a_map_does_not_know_is_not_drawn(tmp_path, what, said):
 
 
 def test_the_real_survey_shows_its_peak_and_its_latched_band(tmp_path, real_data):
-    from magtwin.field.survey.folder import read_survey
+    from magtwin.field.survey.nodes import read_survey
 
     plot_map(read_survey(real_data / "aprilab" / "maps")[0], tmp_path / "a.png", headings=[0.0])
     picture = pixels(tmp_path / "a.png")

@@ -233,7 +233,7 @@ def _picture(file: Path) -> None:
 
 def _readings(file: Path) -> None:
     call(
-        "io.surveys.readings:save_readings",
+        "field.survey.saved:save_readings",
         call("io.surveys.readings:readings_of_run", _run(), name="drive"),
         file,
     )
@@ -246,7 +246,7 @@ def _table(file: Path) -> None:
 
 def _survey(file: Path) -> None:
     folder = file.parent / "survey"
-    call("field.survey.folder:write_survey", _map(), folder)
+    call("field.survey.nodes:write_survey", _map(), folder)
     for path in folder.iterdir():
         shutil.move(path, file.parent / path.name)
     folder.rmdir()
@@ -532,7 +532,7 @@ FORMATS: Mapping[str, Format] = {
     "robot-toml": Format("robot.toml", text(ROBOT), _reads("author.robot:read_settings")),
     "scene-toml": Format("room.toml", _scene_toml, _read_scene_toml, slow=True),
     "suite": Format("suite.toml", text(SUITE), _reads("bench.suite:load_suite")),
-    "survey": Format("0_map.csv", _survey, _reads("field.survey.folder:read_survey", folder=True)),
+    "survey": Format("0_map.csv", _survey, _reads("field.survey.nodes:read_survey", folder=True)),
     "table": Format("x.csv", _table, _READINGS),
     "readings": Format("x.parquet", _readings, _READINGS),
     "path": Format("x.csv", text("x,y\n0,0\n1,0\n1,1\n"), _reads("path.points:read_path_csv")),

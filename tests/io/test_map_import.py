@@ -1,24 +1,21 @@
 """`magtwin map import`, `fit` and `check`: any survey in, what is broken in it said and masked."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from recordings import record
 from test_cli import refused
-from test_gp import survey
 from test_recorded import poses, readings
 from test_stuck import gridded
 
 from magtwin.author.earth import earth_of
 from magtwin.cli import main
 from magtwin.field.sources.earth import earth_field_nt
-from magtwin.field.survey.folder import node_map
+from magtwin.field.survey.saved import load_readings, save_readings
 from magtwin.io.map_files import open_map
-from magtwin.io.surveys.maps import _contradictions, _masked
-from magtwin.io.surveys.readings import load_readings, save_readings
+from magtwin.io.surveys.axes import vector_doubts
 from magtwin.usd.maps.layer import load_map
 from magtwin.usd.scene import read_scene
 
@@ -44,18 +41,27 @@ def test_latched_nodes_leave_the_layers_valid_ones_and_can_be_kept(tmp_path, cap
     assert report["figures"]["stuck at every heading"]["value"] == 17
 
 
-def test_readings_kept_as_parquet_make_the_same_layer_as_the_folder(tmp_path, capsys, real_data):
+def test_readings_kept_as_parquet_make_the_same_layer_as_the_folder_and_keep_what_was_said(
+    tmp_path, capsys, real_data
+):
     maps = real_data / "aprilab/maps"
-    about = ("--name", "lab", "--created", "2024-05-01", "--height-m", "0.35", "--licence", "MIT")
+    about = ("--created", "2024-05-01", "--height-m", "0.35", "--licence", "MIT")
+    about += ("--frame", "world: x east, y north, z up", "--datum", "the door")
     run("map", "import", maps, "--out", tmp_path / "a.parquet", *about)
     run("map", "import", tmp_path / "a.parquet", "--out", tmp_path / "b.usdc", "--name", "lab")
-    run("map", "import", maps, "--out", tmp_path / "c.usdc", *about)
+    run("map", "import", maps, "--out", tmp_path / "c.usdc", "--name", "lab", *about)
+    run("map", "fit", tmp_path / "a.parquet", "--method", "trilinear", "--out", tmp_path / "d.usdc")
     capsys.readouterr()
-    assert load_readings(tmp_path / "a.parquet").good.sum() == np.count_nonzero(
-        load_map(tmp_path / "c.usdc").valid
-    )
-    assert load_map(tmp_path / "b.usdc") == load_map(tmp_path / "c.usdc")
-    assert load_map(tmp_path / "b.usdc").height_m == pytest.approx(0.35)
+    fields = [load_map(tmp_path / f"{name}.usdc") for name in "bcd"]
+    assert load_readings(tmp_path / "a.parquet").good.sum() == np.count_nonzero(fields[0].valid)
+    assert fields[0] == fields[1]
+    for field in fields:
+        said = (field.created, field.licence, field.frame, field.datum)
+        assert said == ("2024-05-01", "MIT", about[7], "the door")
+        assert field.height_m == pytest.approx(0.35)
+    run("map", "validate", tmp_path / "a.parquet", "--method", "trilinear", "--json")
+    report = json.loads(capsys.readouterr().out)
+    assert report["figures"]["readings predicted"]["value"] == np.count_nonzero(fields[0].valid)
 
 
 def test_a_table_becomes_a_file_of_readings_by_its_column_names(tmp_path, capsys):
@@ -120,16 +126,6 @@ def test_what_cannot_be_imported_is_refused_in_one_line_and_nothing_is_written(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv", "m.usdc"]
 
 
-def test_an_import_never_replaces_a_file_unasked(tmp_path, capsys):
-    (tmp_path / "a.csv").write_text("x,y,yaw,field\n0,0,0,41000\n1,0,0,41500\n")
-    (tmp_path / "a.parquet").write_text("mine")
-    arguments = ("map", "import", tmp_path / "a.csv", "--out", tmp_path / "a.parquet")
-    assert "exists already; give --force" in refused(capsys, *arguments)
-    assert (tmp_path / "a.parquet").read_text() == "mine"
-    run(*arguments, "--force")
-    assert len(load_readings(tmp_path / "a.parquet")) == 2
-
-
 def test_a_survey_whose_sensor_was_stuck_throughout_is_refused_unless_it_is_to_be_kept(tmp_path, capsys):
     readings = gridded(0)
     save_readings(readings.with_(b_nt=np.full(len(readings), 41_000.0)), tmp_path / "a.parquet")
@@ -159,22 +155,6 @@ def test_repeats_of_a_fast_logger_are_counted_and_a_fit_that_lacks_readings_name
     assert "5 of 60 readings are good, 55 are masked as stuck (--keep-stuck keeps them)" in line
 
 
-def test_a_fit_and_a_check_run_from_readings_with_latched_ones_out(tmp_path, capsys):
-    def latch(b, rng):
-        b[:, 3:6, 4:8] = np.round(31_000 + 15 * rng.standard_normal((4, 3, 1)), 2)
-        return b
-
-    save_readings(gridded(0, change=latch), tmp_path / "a.parquet")
-    run("map", "fit", tmp_path / "a.parquet", "--method", "trilinear", "--out", tmp_path / "a.usdc", "--json")
-    report = json.loads(capsys.readouterr().out)
-    assert report["figures"]["stuck at every heading"]["value"] == 12
-    field = load_map(tmp_path / "a.usdc")
-    assert field.values_nt[field.valid].min() > 32_000
-    run("map", "validate", tmp_path / "a.parquet", "--method", "trilinear", "--json")
-    report = json.loads(capsys.readouterr().out)
-    assert report["figures"]["readings predicted"]["value"] == 4 * 11 * 17 - 48
-
-
 @pytest.mark.parametrize("headings", ["", "north", "0,nan", "0;90"])
 def test_headings_that_are_none_are_refused(tmp_path, capsys, headings):
     save_readings(gridded(0), tmp_path / "a.parquet")
@@ -190,18 +170,19 @@ def test_headings_that_are_none_are_refused(tmp_path, capsys, headings):
     assert "headings are degrees with commas between" in refused(capsys, *arguments)
 
 
-def test_frame_and_datum_are_said_at_import_or_fit_and_kept_from_readings_to_map(tmp_path, capsys, real_data):
-    maps = real_data / "aprilab/maps"
-    said = ("--frame", "world: x east, y north, z up", "--datum", "the door", "--licence", "MIT")
-    run("map", "import", maps, "--out", tmp_path / "a.parquet", *said)
-    run("map", "import", maps, "--out", tmp_path / "a.usdc", *said)
-    run("map", "fit", tmp_path / "a.parquet", "--method", "trilinear", "--out", tmp_path / "b.usdc")
-    run("map", "fit", maps, "--method", "trilinear", "--out", tmp_path / "c.usdc", *said[2:])
-    capsys.readouterr()
-    for name in ("a", "b"):
-        field = load_map(tmp_path / f"{name}.usdc")
-        assert (field.frame, field.datum, field.licence) == (said[1], "the door", "MIT")
-    assert (load_map(tmp_path / "c.usdc").frame, load_map(tmp_path / "c.usdc").datum) == ("", "the door")
+@pytest.mark.parametrize(
+    ("text", "flags"),
+    [
+        ("x,y,field\n0,0,41000\n", "--heading none"),
+        ("x,y,yaw,field\n0,0,90,41000\n", "--heading-unit deg"),
+        ("u,v,yaw,field\n0,0,0,41000\n", "--x NAME --y NAME"),
+        ("x,y,yaw,strength\n0,0,0,41000\n", "--field NAME"),
+    ],
+)
+def test_a_fit_of_a_table_that_must_be_told_names_the_import_to_type(tmp_path, capsys, text, flags):
+    (tmp_path / "a b.csv").write_text(text)
+    line = refused(capsys, "map", "fit", tmp_path / "a b.csv", "--out", tmp_path / "m.usdc")
+    assert line.endswith(f"magtwin map import '{tmp_path}/a b.csv' {flags} --out 'a b.parquet'")
 
 
 @pytest.mark.parametrize(
@@ -218,30 +199,6 @@ def test_a_day_or_a_height_that_is_none_is_refused(tmp_path, capsys, real_data, 
     assert not (tmp_path / "a.usdc").exists()
 
 
-def test_a_refusal_names_the_survey_not_the_file_to_be_written(tmp_path, capsys):
-    (tmp_path / "hall.csv").write_text("x,y,heading,field\n0,0,0,41000\n1,0,0,42000\n")
-    with pytest.raises(SystemExit):
-        run("map", "fit", tmp_path / "hall.csv", "--out", tmp_path / "z.usdc")
-    assert "hall.csv: 2 of 2 readings are good" in capsys.readouterr().err
-
-
-def test_runs_under_several_licences_keep_all_of_them(tmp_path, capsys):
-    for name, licence in (("a", "MIT"), ("b", "CC-BY-4.0")):
-        (tmp_path / f"{name}.csv").write_text("x,y,heading,field\n0,0,0,41000\n1,0,0,42000\n")
-        run(
-            "map",
-            "import",
-            tmp_path / f"{name}.csv",
-            "--out",
-            tmp_path / f"{name}.parquet",
-            "--licence",
-            licence,
-        )
-    run("map", "import", tmp_path / "a.parquet", tmp_path / "b.parquet", "--out", tmp_path / "c.parquet")
-    capsys.readouterr()
-    assert load_readings(tmp_path / "c.parquet").licence == "MIT; CC-BY-4.0"
-
-
 def test_the_earths_field_is_taken_from_a_place_and_day_as_numbers_or_from_a_scene(lab_scene):
     place = earth_of("29.64, -82.35, 50, 2024-06-01")
     assert place == earth_field_nt(29.64, -82.35, 50.0, "2024-06-01")
@@ -255,28 +212,11 @@ def test_a_survey_of_a_twin_knows_the_earths_field_and_keeps_it(tmp_path, capsys
     assert load_readings(out).earth_nt == read_scene(lab_scene, check_network=False).earth.b_world_nt
 
 
-def test_a_check_takes_the_kernel_of_the_gaussian_process_and_leaves_headings_out(tmp_path, capsys):
-    save_readings(survey(rows=5, columns=5), tmp_path / "a.parquet")
-
-    def told(*more):
-        run("map", "validate", tmp_path / "a.parquet", "--json", *more)
-        report = json.loads(capsys.readouterr().out)
-        return report["metadata"]["split"], report["figures"]
-
-    matern = told("--method", "gp", "--kernel", "matern")[1]["gp RMSE"]["value"]
-    poisson = told("--method", "gp", "--kernel", "poisson")[1]["gp RMSE"]["value"]
-    assert told("--method", "gp")[1]["gp RMSE"]["value"] == poisson != matern
-    split, figures = told("--method", "trilinear", "--split", "heading")
-    assert split == "one heading at a time"
-    assert figures["turns"]["value"] == 4
-    assert figures["trilinear predicted"]["value"] == 100
-
-
 @pytest.mark.parametrize(
     ("arguments", "what"),
     [
         (("--method", "cubic", "--kernel", "matern"), "--kernel is for --method gp; drop it"),
-        (("--method", "gp", "--earth", "1,2,3"), "--earth is for --method harmonic; drop it"),
+        (("--method", "gp", "--earth", "20000,0,-40000"), "--earth is for --method harmonic; drop it"),
         (("--earth", "1,2,south"), "--earth is a scene; latitude,longitude,height,date; or x,y,z in nT"),
         (("--earth", "0,0,0"), "earth_nt must be three numbers"),
         (
@@ -328,23 +268,13 @@ def test_vectors_and_headings_that_contradict_each_other_are_a_doubt(tmp_path, c
     run("map", "import", tmp_path / "hall.csv", "--out", tmp_path / "a.parquet", "--json")
     (doubt,) = json.loads(capsys.readouterr().out)["metadata"]["doubts"]
     assert doubt.startswith("vectors keep no direction in world axes (")
-    (fitted,) = _contradictions(load_readings(tmp_path / "a.parquet"))
+    (fitted,) = vector_doubts(load_readings(tmp_path / "a.parquet"))
     assert fitted == doubt
 
 
-def test_a_map_with_hardly_a_node_is_a_doubt():
-    field = node_map(gridded(0))
-    valid = np.zeros(field.valid.shape, bool)
-    assert not _masked(field)
-    valid[0, 0, :5] = True
-    (doubt,) = _masked(replace(field, valid=valid))
-    assert doubt.startswith(f"{valid.size - 5} of {valid.size} nodes are masked")
-
-
-@pytest.mark.parametrize("method", ["harmonic", "gp", "trilinear"])
-def test_too_few_readings_are_no_map(tmp_path, capsys, method):
+def test_too_few_readings_are_no_map(tmp_path, capsys):
     rows = "".join(f"{x},{x % 2},{x},41000\n" for x in range(7))
     (tmp_path / "hall.csv").write_text("x,y,heading,field\n" + rows)
     with pytest.raises(SystemExit):
-        run("map", "fit", tmp_path / "hall.csv", "--method", method, "--out", tmp_path / "z.usdc")
+        run("map", "fit", tmp_path / "hall.csv", "--out", tmp_path / "z.usdc")
     assert "hall.csv: 7 of 7 readings are good; a map needs 8 at least" in capsys.readouterr().err

@@ -61,12 +61,6 @@ def test_a_table_of_scans_comes_back_to_the_bit_and_is_written_alike(scans, tmp_
     assert pq.read_schema(tmp_path / "a.parquet").field("ranges_m").metadata[b"unit"] == b"m"
 
 
-def test_no_scans_are_a_table_too(twin, run, tmp_path):
-    off = scan(twin, run.with_columns(lidar_on=np.zeros(run.rows, bool)))
-    write_scans(off, tmp_path / "none.parquet")
-    assert read_scans(tmp_path / "none.parquet").ranges_m.shape == (0, twin.scene.robot.lidar.rays)
-
-
 def test_what_is_no_table_of_scans_is_refused(scans, tmp_path):
     write_scans(scans, tmp_path / "a.parquet")
     with pytest.raises(InputError, match="exists"):

@@ -10,11 +10,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from magtwin.errors import InputError
 from magtwin.field.grid import Grid
 from magtwin.field.survey.readings import SHAPES, Readings
+from magtwin.field.survey.saved import load_readings, save_readings
 from magtwin.files.file import sha256
 from magtwin.frames import quat_from_rpy, quat_from_yaw, quat_multiply
 from magtwin.io.surveys.columns import Columns
-from magtwin.io.surveys.readings import load_readings, read_readings, readings_of_run, save_readings
-from magtwin.run.run import Run
+from magtwin.io.surveys.readings import read_readings
 
 ROWS = "x,y,heading,field\n0,0,0.5,41000\n1,0,1.5,41500\n0,1,-3,40500\n"
 WORLD = np.array([12_000.0, 20_000.0, -38_000.0])
@@ -92,56 +92,12 @@ def test_units_count_for_columns_that_an_option_names_without_them(tmp_path, hea
     assert_allclose(readings.b_nt, [41_000, 41_500])
 
 
-def test_a_unit_of_x_that_is_no_length_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"a\.csv: 'x \[px\]' is no length"):
-        read_readings(file(tmp_path, "x [px],y,yaw,b\n0,0,0,41000\n"))
-
-
-def test_a_survey_that_spans_far_is_read_in_metres_with_a_note(tmp_path):
-    text = "{},y,yaw,b\n-150,0,0,41000\n150,0,0,41000\n"
-    (note,) = taken(read_readings(file(tmp_path, text.format("x"))))
-    assert note == "x and y in metres, over 300 m: if these are cm, write x [cm],y [cm] in the header"
-    assert not taken(read_readings(file(tmp_path, text.format("x [m]"), "b.csv")))
-
-
-def test_a_survey_of_millimetres_away_from_the_origin_may_be_in_degrees(tmp_path):
-    (note,) = taken(
-        read_readings(file(tmp_path, "x,y,yaw,b\n-82.35,29.65,0,41000\n-82.35004,29.65,0,41000\n"))
-    )
-    assert note == "x and y in metres, over 0.04 mm only: if these are degrees, convert them to metres"
-
-
-def test_cells_that_spreadsheets_write_for_nothing_are_missing(tmp_path):
-    rows = [f"{word},0,0.5,41000\n" for word in ("#N/A", "N/A", "NULL", "-", "#DIV/0!", "", "nan")]
-    readings = read_readings(file(tmp_path, ROWS + "".join(rows)))
-    assert len(readings) == 3
-    assert "(7 of 10 rows without a value left out)" in readings.source
-
-
-def test_a_last_number_that_was_cut_short_is_left_out(tmp_path):
-    rows = [f"{k},0,0.5,{45_000 + k}.25" for k in range(10)]
-    whole = read_readings(file(tmp_path, "x,y,heading,field\n" + "\n".join(rows)))  # no end, but sound
-    assert len(whole) == 10
-    cut = read_readings(file(tmp_path, "x,y,heading,field\n" + "\n".join(rows)[:-6], "b.csv"))
-    assert len(cut) == 9
-    assert "(1 of 10 rows without a value left out)" in cut.source
-    assert taken(cut) == [
-        "line 11 as cut short and left out: it has no end, and its 45 is far below all other values"
-    ]
-
-
 def test_a_survey_given_twice_counts_once(tmp_path):
     a, b = file(tmp_path, ROWS), file(tmp_path, ROWS, "b.csv")
     other = file(tmp_path, ROWS.replace("41500", "41600"), "c.csv")
     readings = read_readings(a, b, other)
     assert readings.runs == ("a", "c")
     assert taken(readings) == [f"{b} and {a} as one, since their bytes are equal"]
-
-
-@pytest.mark.parametrize(("unit", "factor"), [("nT", 1), ("uT", 1e3), ("T", 1e9), ("mG", 1e2), ("G", 1e5)])
-def test_units_are_turned_into_nt(tmp_path, unit, factor):
-    path = file(tmp_path, f"x,y,yaw,b\n0,0,0,{41_000 / factor!r}\n")
-    assert_allclose(read_readings(path, columns=Columns(field="b", unit=unit)).b_nt, [41_000], rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -170,15 +126,75 @@ def test_a_unit_that_is_not_given_follows_from_the_size_and_is_told(tmp_path, va
     assert (told in readings.source) == (unit != "nT")
 
 
-def test_a_size_of_no_unit_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"a\.csv: the median of field is 3 nT, .*no usual unit makes it"):
-        read_readings(file(tmp_path, "x,y,yaw,field\n0,0,0,3\n"))
+@pytest.mark.parametrize(
+    "header",
+    [
+        f"Timestamp,x,y,Yaw,{name}"
+        for name in (
+            "b_total",
+            "B",
+            "|B|",
+            "b_uT",
+            "Total_Field",
+            "Absolute field (\N{MICRO SIGN}T)",
+            "TMI [uT]",
+        )
+    ]
+    + [
+        "t,p_world_base_x,p_world_base_y,yaw,BT",
+        "time_ms,pos_x,pos_y,theta,field_ut",
+        "t,pose.x,pose.y,yaw,mag",
+    ]
+    + [
+        "Time (s);Rechtswert [m];Hochwert [m];heading;Feldst\u00e4rke [\u00b5T]",
+        "t,Easting (m),Northing (m),yaw,F",
+    ],
+)
+def test_columns_are_found_by_usual_names_whatever_wrote_them(tmp_path, header):
+    separator = ";" if ";" in header else ","
+    (tmp_path / "a.csv").write_text(
+        f"{header}\n{separator.join(['5500', '1', '2', '.25', '41'])}\n", encoding="cp1252"
+    )
+    readings = read_readings(tmp_path / "a.csv")
+    assert (readings.b_nt[0], readings.yaw[0]) == (41e3, 0.25)
+    assert readings.p_xy.tolist() == [[1, 2]]
+    assert readings.t[0] == (5.5 if "ms" in header else 5500)
+    assert any(note.endswith("(--x, --y)") for note in taken(readings)) == ("x,y" not in header)
 
 
-@pytest.mark.parametrize("name", ["b_total", "B", "|B|", "b_uT", "Total_Field"])
-def test_a_magnitude_is_found_by_its_usual_names(tmp_path, name):
-    readings = read_readings(file(tmp_path, f"Timestamp,x,y,Yaw,{name}\n5.5,0,0,0.25,41\n"))
-    assert (readings.b_nt[0], readings.yaw[0], readings.t[0]) == (41e3, 0.25, 5.5)
+@pytest.mark.parametrize(
+    ("x", "note"),
+    [
+        ((-150, 150), "over 300 m: if these are cm"),
+        ((-82.35, -82.35004), "over 0.04 mm only: if these are degrees"),
+        ((-2, 2), ""),
+    ],
+)
+def test_positions_of_an_unlikely_size_have_a_note(tmp_path, x, note):
+    text = "x,y,yaw,b\n" + "".join(f"{v},29.65,0,41000\n" for v in x)
+    assert note in "".join(taken(read_readings(file(tmp_path, text))))
+    assert not taken(read_readings(file(tmp_path, text.replace("x,", "x [m],"), "b.csv")))
+
+
+@pytest.mark.parametrize(
+    ("header", "nt"),
+    [
+        (
+            "Magnetic field x (\N{MICRO SIGN}T),MAGNETIC FIELD Y (uT),Magnetic field z (uT)",
+            1e3,
+        ),
+        ("/magnetic_field/x,/magnetic_field/y,/magnetic_field/z", 1e3),
+        ("X_uT,Y_uT,Z_uT", 1e3),
+        ("b_x_nT,b_y_nT,b_z_nT", 1),
+        ("Bx (milligauss),By (milligauss),Bz (milligauss)", 1e2),
+        ("Bx (gauss),By (gauss),Bz (gauss)", 1e5),
+    ],
+)
+def test_components_are_found_by_the_names_and_units_of_phone_apps(tmp_path, header, nt):
+    values = ",".join(repr(v / nt) for v in WORLD.tolist())
+    readings = read_readings(file(tmp_path, f"Time (s),x (m),y (m),yaw,{header}\n0,1,2,0.5,{values}\n"))
+    assert_allclose(readings.b_body_nt, [WORLD])
+    assert_array_equal(readings.p_xy, [[1, 2]])
 
 
 def test_components_are_found_by_their_usual_names_where_there_is_no_magnitude(tmp_path):
@@ -188,47 +204,6 @@ def test_components_are_found_by_their_usual_names_where_there_is_no_magnitude(t
     assert "taken bx,by,bz as the field in the robot's axes" in readings.source
     both = read_readings(file(tmp_path, "x,y,yaw,field,bx,by,bz\n0,0,0,40000,3,4,-40\n"))
     assert both.b_body_nt is None, "a magnitude that is there is what is read"
-
-
-@pytest.mark.parametrize(
-    ("header", "nt"),
-    [
-        ("Magnetic field x (\N{MICRO SIGN}T),Magnetic field y (\N{MICRO SIGN}T),Magnetic field z (uT)", 1e3),
-        ("MAGNETIC FIELD X (\N{GREEK SMALL LETTER MU}T),MAGNETIC FIELD Y (uT),MAGNETIC FIELD Z (uT)", 1e3),
-        ("/magnetic_field/x,/magnetic_field/y,/magnetic_field/z", 1e3),
-        ("mag_x_ut,mag_y_ut,mag_z_ut", 1e3),
-        ("X_uT,Y_uT,Z_uT", 1e3),
-        ("b_x_nT,b_y_nT,b_z_nT", 1),
-        ("Bx [microtesla],By [microtesla],Bz [microtesla]", 1e3),
-        ("Bx (milligauss),By (milligauss),Bz (milligauss)", 1e2),
-        ("Bx (gauss),By (gauss),Bz (gauss)", 1e5),
-    ],
-)
-def test_components_are_found_by_the_names_and_units_of_phone_apps(tmp_path, header, nt):
-    values = ",".join(repr(v / nt) for v in WORLD.tolist())
-    text = f"Time (s),x (m),y (m),yaw,{header}\n0,1,2,0.5,{values}\n"
-    readings = read_readings(file(tmp_path, text))
-    assert_allclose(readings.b_body_nt, [WORLD])
-    assert_array_equal(readings.p_xy, [[1, 2]])
-
-
-@pytest.mark.parametrize("name", ["Absolute field (\N{MICRO SIGN}T)", "BT", "field_ut", "B_abs [microtesla]"])
-def test_a_magnitude_is_found_by_the_names_of_phone_apps(tmp_path, name):
-    assert_allclose(read_readings(file(tmp_path, f"x,y,yaw,{name}\n0,0,0,41\n")).b_nt, [41_000])
-
-
-@pytest.mark.parametrize("names", ["p_world_base_x,p_world_base_y", "pos_x,pos_y"])
-def test_positions_are_found_by_other_usual_names_and_told(tmp_path, names):
-    readings = read_readings(file(tmp_path, f"t,{names},yaw,b_total_nt\n0,1,2,0.5,41000\n"))
-    assert_array_equal(readings.p_xy, [[1, 2]])
-    assert taken(readings) == [f"{names.replace(',', ' and ')} as x and y (--x, --y)"]
-
-
-def test_a_unit_in_a_header_holds_for_a_column_that_is_named_by_its_number(tmp_path):
-    path = file(tmp_path, "x [cm],y [cm],yaw [deg],b [uT]\n100,200,90,41\n")
-    readings = read_readings(path, columns=Columns(x="1", y="2", heading="3", field="4"))
-    assert_array_equal(readings.p_xy, [[1, 2]])
-    assert_allclose((readings.yaw[0], readings.b_nt[0]), (np.pi / 2, 41_000))
 
 
 @pytest.mark.parametrize(
@@ -252,12 +227,6 @@ def test_times_are_read_in_the_unit_of_their_name_or_size(tmp_path, name, ticks,
     readings = read_readings(path, columns=Columns(time=name if given else ""))
     assert_allclose(readings.t - 1763800000, [0, 1, 2], atol=1e-6)
     assert taken(readings) == [note] * bool(note)
-
-
-def test_a_note_on_times_is_whole(tmp_path):
-    readings = read_readings(file(tmp_path, "time,x,y,yaw,field\n08:26,0,0,0,41000\n"))
-    assert readings.t is None
-    assert taken(readings)[0].endswith("such as 2025-11-22T08:26:40, got '08:26'")
 
 
 @pytest.mark.parametrize(("said", "fits"), [(None, "world"), ("body", "world"), ("world", "body")])
@@ -304,22 +273,6 @@ def test_a_quaternion_is_taken_by_the_letters_of_its_names(tmp_path):
     assert taken(readings) == ["qw,qx,qy,qz as qx,qy,qz,qw, by their names (--quaternion)"]
 
 
-def test_headings_in_degrees_are_refused_until_said_so_and_turns_that_count_are_taken(tmp_path):
-    path = file(tmp_path, "x,y,heading,field\n0,0,1,41000\n1,0,90,41500\n")
-    with pytest.raises(InputError, match=r"a\.csv:3: heading 90 is beyond a full turn in radians"):
-        read_readings(path)
-    assert_allclose(read_readings(path, columns=Columns(heading_unit="deg")).yaw, np.radians([1, 90]))
-    assert_array_equal(read_readings(path, columns=Columns(heading_unit="rad")).yaw, [1, 90])
-
-
-def test_columns_go_by_number_where_there_is_no_header(tmp_path):
-    path = file(tmp_path, "7,0,0,0.5,41000\n8,1,0,1.5,41500\n")
-    columns = Columns(time="1", x="2", y="3", heading="4", field="5")
-    readings = read_readings(path, columns=columns)
-    assert_array_equal(readings.t, [7, 8])
-    assert_array_equal(readings.b_nt, [41_000, 41_500])
-
-
 @settings(max_examples=30, deadline=None)
 @given(yaw=st.floats(-3, 3), roll=st.floats(-0.3, 0.3), pitch=st.floats(-0.3, 0.3))
 def test_a_vector_in_body_axes_with_a_quaternion_is_the_world_vector_turned_back_by_the_heading(
@@ -357,8 +310,6 @@ def test_magnitudes_of_a_sensor_carried_by_hand_need_no_heading(tmp_path):
     assert_allclose(readings.b_nt, np.linalg.norm(WORLD))
     assert readings.b_body_nt is None
     assert "the magnitude of bx,by,bz, since a sensor carried by hand has no heading" in taken(readings)
-    named = file(tmp_path, "x,y,field,none\n0,0,41,1.5\n", "b.csv")  # a column of that name is read
-    assert_array_equal(read_readings(named, columns=Columns(heading="none")).yaw, [1.5])
 
 
 def test_rows_without_a_value_are_left_out_and_the_source_tells_how_many(tmp_path):
@@ -368,21 +319,6 @@ def test_rows_without_a_value_are_left_out_and_the_source_tells_how_many(tmp_pat
     assert readings.source.endswith("(3 of 6 rows without a value left out)")
     with pytest.raises(InputError, match="no row is complete; all 1 have a cell"):
         read_readings(file(tmp_path, "x,y,heading,field\n0,0,0,nan\n", "b.csv"))
-
-
-def test_a_column_tells_runs_apart(tmp_path):
-    path = file(tmp_path, "x,y,yaw,field,day\n0,0,0,41000,tue\n1,0,0,41500,mon\n2,0,0,41200,tue\n")
-    readings = read_readings(path, columns=Columns(run_column="day"))
-    assert readings.runs == ("a tue", "a mon")
-    assert_array_equal(readings.run, [0, 1, 0])
-
-
-def test_several_files_are_several_runs(tmp_path):
-    a, b = file(tmp_path, ROWS), file(tmp_path, ROWS + "\n", "b.csv")
-    readings = read_readings(a, b)
-    assert readings.runs == ("a", "b")
-    assert_array_equal(readings.run, [0, 0, 0, 1, 1, 1])
-    assert "b.csv sha256:" in readings.source
 
 
 def test_files_joined_by_a_plus_stand_side_by_side(tmp_path):
@@ -418,18 +354,6 @@ def test_the_real_vector_survey_is_read_from_its_triples(real_data):
     assert_allclose(readings.b_nt[readings.run == 2], np.linalg.norm(raw, axis=1), rtol=1e-15)
 
 
-def test_a_gridded_folder_keeps_recorded_headings_beside_its_nodes(real_data):
-    readings = read_readings(real_data / "aprilab/maps", licence="MIT")
-    table = np.loadtxt(real_data / "aprilab/maps/90_map.csv", delimiter=",")
-    rows = readings.run == 1
-    assert readings.runs[1] == "90_map.csv"
-    assert_array_equal(readings.yaw[rows], table[:, 2])
-    assert_array_equal(readings.b_nt[rows], table[:, 3])
-    p, yaw = readings.grid.poses()
-    assert_allclose(p[tuple(readings.node.T)], readings.p_xy, atol=1e-12)
-    assert_allclose(yaw[tuple(readings.node[rows].T)], np.pi / 2)
-
-
 def test_a_run_becomes_readings_at_the_true_poses_with_lost_lock_not_good(lab_scene, tmp_path):
     import magtwin
     from magtwin.io.tables import write_parquet
@@ -447,12 +371,6 @@ def test_a_run_becomes_readings_at_the_true_poses_with_lost_lock_not_good(lab_sc
     assert_array_equal(readings.b_nt, b[kept])
     assert_array_equal(readings.good, ~lost[kept])
     assert readings.source.endswith(f"(1 of {run.rows} rows without a value left out)")
-
-
-def test_a_run_whose_field_is_unknown_throughout_is_refused():
-    unknown = {"t": [0.0], "p_world_base": [[0, 0, 0]], "yaw": [0.0], "b_total_nt": [np.nan]}
-    with pytest.raises(InputError, match="b_measured_nt and b_total_nt hold no field"):
-        readings_of_run(Run(unknown))
 
 
 @st.composite
@@ -510,18 +428,6 @@ def test_the_same_readings_give_the_same_bytes_with_units_on_every_column(tmp_pa
         save_readings(readings, tmp_path / "a.parquet")
 
 
-def test_readings_of_other_programs_parquet_go_by_column_names(tmp_path):
-    import pyarrow as pa
-
-    pq.write_table(
-        pa.table({"px": [0.0, 1.0], "py": [0, 1], "yaw": [0.0, 1.0], "b": [41.0, 42.0]}), tmp_path / "a.pq"
-    )
-    readings = read_readings(tmp_path / "a.pq", columns=Columns(x="px", y="py", field="b", unit="uT"))
-    assert_array_equal(readings.b_nt, [41_000, 42_000])
-    with pytest.raises(InputError, match="no Readings: metadata 'magtwin_readings' is missing"):
-        load_readings(tmp_path / "a.pq")
-
-
 @pytest.mark.parametrize("change", ["{", "[]", "{}", '{"grid": {"rows": "no"}}', "null"])
 def test_damaged_metadata_is_refused(tmp_path, change):
     readings = read_readings(file(tmp_path, ROWS))
@@ -545,8 +451,10 @@ def test_readings_whose_columns_do_not_fit_are_refused_with_the_file(tmp_path):
 
 
 REFUSALS = {
+    "x in no length": ("x [px],y,yaw,b\n0,0,0,41000\n", {}, r"a\.csv: 'x \[px\]' is in no unit of x"),
+    "no unit fits": ("x,y,yaw,field\n0,0,0,3\n", {}, r"a\.csv: the median of field is 3 nT, .*no usual unit"),
     "missing": (None, {}, r"a\.csv: no such source of readings"),
-    "no x": ("px,y,yaw,field\n0,0,0,41000\n", {}, r"a\.csv: no column 'x'; did you mean 'px'"),
+    "no x": ("u,y,yaw,field\n0,0,0,41000\n", {}, r"a\.csv: no column of x and of y .*--x NAME --y NAME"),
     "no heading": (
         "x,y,field\n0,0,41000\n",
         {},
@@ -658,21 +566,6 @@ def test_a_gridded_survey_is_not_one_of_several_sources(tmp_path, real_data):
         read_readings(real_data / "aprilab/maps", file(tmp_path, ROWS))
 
 
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"created": "last May"}, "created of Readings must be a day YYYY-MM-DD, got 'last May'"),
-        ({"created": 20260102}, "created of Readings must be a text, got 20260102"),
-        ({"licence": None}, "licence of Readings must be a text, got None"),
-        ({"p_xy": [[0.0, -1e9]]}, r"p_xy of Readings lies within 1e\+08 m of the origin, got .* in row 0"),
-    ],
-)
-def test_what_a_survey_says_of_itself_has_its_form(changes, said):
-    given = {"p_xy": [[0.0, 0.0]], "yaw": [0.0], "b_nt": [4e4]}
-    with pytest.raises(InputError, match=said):
-        Readings(**{**given, **changes})
-
-
 @pytest.mark.parametrize("every", [slice(2, None, 3), slice(25, None)])
 def test_rows_of_two_units_are_refused_by_the_first_line_that_is_off_unless_the_unit_is_given(
     tmp_path, every
@@ -708,25 +601,12 @@ def test_a_survey_beside_steel_is_read_in_the_unit_that_was_told_with_a_warning(
     assert "is 247000 nT, outside 10,000..100,000 nT, in mG it would be 24,700 nT" in readings.source
 
 
-def test_an_outlier_is_no_row_of_another_unit(tmp_path):
-    rows = [f"{k},0,0,{41_000 + k if k != 7 else 410}\n" for k in range(1, 300)]
-    assert len(read_readings(file(tmp_path, "x,y,yaw,field\n" + "".join(rows)))) == 299
-
-
 def test_a_scale_takes_the_values_of_a_normalised_sensor_to_nt(tmp_path):
     path = file(tmp_path, "x,y,yaw,b,bx,by,bz\n0,0,0,0.9,0.3,0.2,-0.8\n1,0,1,1.1,0.5,0,-1\n")
     scaled = read_readings(path, columns=Columns(field="b", scale=45_000.0))
     assert_allclose(scaled.b_nt, [40_500, 49_500])
     body = read_readings(path, columns=Columns(vector="bx,by,bz", scale=45_000.0)).b_body_nt
     assert_allclose(body, 45_000 * np.array([[0.3, 0.2, -0.8], [0.5, 0, -1]]))
-
-
-def test_a_scale_takes_a_folder_of_csvs_to_nt(tmp_path):
-    text = "# x,y,theta,scalar_mag\n0,0,{0},1\n1,0,{0},1.1\n0,1,{0},0.9\n1,1,{0},1\n"
-    for heading in (0, 90, 180, 270):
-        file(tmp_path, text.format(np.radians(heading)), f"{heading}_map.csv")
-    readings = read_readings(tmp_path, columns=Columns(scale=45_000.0))
-    assert_allclose(np.unique(readings.b_nt), [40_500, 45_000, 49_500])
 
 
 def test_a_scale_that_cannot_be_is_refused_with_one_that_could(tmp_path):
@@ -753,12 +633,6 @@ def test_a_pattern_stands_for_the_files_that_match_it_in_the_order_of_their_name
     assert same(read_readings("drive_?.csv"), want)
     with pytest.raises(InputError, match=r"^no file or folder matches 'nowhere/\*\.csv'; check the pattern$"):
         read_readings("nowhere/*.csv")
-
-
-def test_a_file_whose_name_looks_like_a_pattern_is_that_file(tmp_path):
-    file(tmp_path, ROWS, "a1.csv")
-    own = file(tmp_path, ROWS.replace("41000", "42000"), "a[1].csv")
-    assert read_readings(own).b_nt[0] == 42_000
 
 
 def test_a_folder_of_parquet_files_is_several_runs(tmp_path):

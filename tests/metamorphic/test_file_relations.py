@@ -83,17 +83,3 @@ def test_a_run_survives_another_format_and_back(tmp_path, suffix):
     again = read_run(tmp_path / "again.npz")
     for name in run:
         assert_allclose(again[name], run[name], rtol=1e-9, atol=1e-9)
-
-
-def test_a_run_cut_in_two_and_joined_is_the_run():
-    run = drive(wavy_map(0), 3, seconds=4.0).readings
-    again = type(run).concat([run.take(slice(0, 9)), run.take(slice(9, None))])
-    for name in run:
-        assert_allclose(again[name], run[name], rtol=0, atol=0)
-
-
-def test_a_run_that_is_thinned_twice_by_two_is_thinned_by_four():
-    run = drive(wavy_map(0), 3, seconds=4.0).readings
-    twice, once = run.take(slice(None, None, 2)).take(slice(None, None, 2)), run.take(slice(None, None, 4))
-    for name in run:
-        assert_allclose(twice[name], once[name], rtol=0, atol=0)

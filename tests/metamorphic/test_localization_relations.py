@@ -10,7 +10,6 @@ from synthetic import drive, wavy_map
 
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.track import track
-from magtwin.run.run import Run
 
 EXACT = ("ekf", "odometry", "smoother")  # Methods without random draws
 METHODS = (*EXACT, "rbpf")
@@ -102,14 +101,6 @@ def test_a_bias_of_the_readings_alone_is_taken_for_the_offset_of_the_sensor(case
     again = followed("ekf", case.problem, readings).pose
     # 100 nT are a fifth of the offset's prior standard deviation, which the drive soon finds out
     assert np.hypot(*(again - tracks["ekf"].pose)[-1, :2]) < 0.02
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_the_order_of_columns_and_the_time_of_day_do_not_matter(method, case, tracks):
-    columns = {name: case.readings[name] for name in reversed(list(case.readings))}
-    columns["t"] = columns["t"] + 1_000.0
-    again = followed(method, case.problem, Run(columns)).pose
-    assert_allclose(again, tracks[method].pose, atol=1e-6)
 
 
 def test_the_same_seed_gives_the_same_track_and_another_one_a_near_one(case, tracks):

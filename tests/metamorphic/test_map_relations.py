@@ -82,16 +82,6 @@ def test_a_map_is_linear_in_its_values(field):
     assert_allclose(other.lookup(p, yaw), 3 * field.lookup(p, yaw) - 1_000, rtol=1e-12)
 
 
-def test_a_full_turn_changes_nothing(field):
-    p, yaw = places()
-    assert_allclose(field.lookup(p, yaw + 2 * np.pi), field.lookup(p, yaw), rtol=1e-10)
-
-
-def test_places_are_read_one_by_one_as_all_together(field):
-    p, yaw = places(20)
-    assert_array_equal([field.lookup(*pose) for pose in zip(p, yaw, strict=True)], field.lookup(p, yaw))
-
-
 def test_a_map_differs_from_itself_by_nothing_and_from_a_shifted_one_by_the_shift(field):
     for shift in (0.0, 250.0):
         off = difference(field, replace(field, values_nt=field.values_nt + shift))

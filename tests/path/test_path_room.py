@@ -12,7 +12,6 @@ from magtwin.errors import InputError
 from magtwin.path import CASES, PATHS, Path, check_clear, check_on_floor, path_named
 from magtwin.path.room import FLOOR_M, RADIUS_M, Room, fit_path, path_in
 from magtwin.spec.obstacles import Obstacles
-from magtwin.twin import open_twin, simulate
 
 
 def box(x: float, y: float, wide: float, deep: float) -> np.ndarray:
@@ -28,12 +27,6 @@ def test_on_the_default_floor_named_paths_are_as_they_were_to_the_bit(name):
     path, made = path_in(room(*FLOOR_M), name), path_named(name)
     assert path.placing == ()
     assert path.p_xy.tobytes() == made.p_xy.tobytes()
-
-
-def test_the_default_lab_leaves_every_named_path_as_it_is(lab_scene):
-    twin = open_twin(lab_scene)
-    lab = Room(twin.scene.lab.floor_m, twin.scene.robot.footprint_radius_m, twin.obstacles)
-    assert all(path_in(lab, name).placing == () for name in PATHS)
 
 
 @settings(max_examples=30, deadline=None)
@@ -137,8 +130,3 @@ def test_a_fitted_run_is_repeated_to_the_bit(lab_scene, tmp_path, capsys):
     assert "yes, to the bit" in capsys.readouterr().out
     with pytest.raises(InputError, match="--fit is for a path"):
         main([*run[:2], "--path", "random", "--fit", "--debug"])
-
-
-def test_a_run_on_the_default_lab_says_nothing_of_a_placing(lab_scene):
-    run = simulate(open_twin(lab_scene, network="none"), "figure8", duration_s=1.0, rate_hz=5.0)
-    assert "path_placing" not in run.metadata

@@ -390,7 +390,7 @@ LARGE = {
     "Parquet": ("a.parquet", read_run),
     "CSV": ("a.csv", read_run),
     "text": ("a.csv", call("path:read_path_csv")),
-    "readings": ("a.csv", call("io.surveys.table:read_csv")),
+    "readings": ("a.csv", call("tables.table:read_table")),
     "recording": ("a.json", call("io.release:read_release")),
     "rrd": ("a.rrd", read_run),
     "bag": ("a.mcap", read_run),

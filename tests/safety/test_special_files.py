@@ -116,7 +116,8 @@ def test_a_pipe_as_a_layer_or_as_a_part_of_a_run_is_refused(tmp_path):
     (tmp_path / "stage.usda").write_text('#usda 1.0\n(subLayers = [@./below.usda@])\ndef "World" {}\n')
     with pytest.raises(InputError, match=r"names .*below\.usda, which is no regular file"):
         open_stage(tmp_path / "stage.usda")
-    from magtwin.io.tables import load_parquet, read_parquet
+    from magtwin.io.tables import read_parquet
+    from magtwin.tables.parquet import load_parquet
 
     os.mkfifo(tmp_path / "part-000000.parquet")
     for read, path in ((read_parquet, tmp_path), (load_parquet, tmp_path / "part-000000.parquet")):

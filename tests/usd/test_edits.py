@@ -15,10 +15,10 @@ from pxr import Gf, Sdf, Usd, UsdGeom
 
 import magtwin
 from magtwin.errors import InputError, MismatchWarning
-from magtwin.io.surveys.maps import survey_scene
 from magtwin.sim.at_rest import field_at_rest_nt
 from magtwin.spec.base import ZERO3
 from magtwin.twin import simulate_robots
+from magtwin.twin.maps import survey_scene
 from magtwin.usd.layers import open_stage
 from magtwin.usd.scene import open_scene, read_scene
 

@@ -13,7 +13,7 @@ from pxr import Usd, Vt
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.survey.folder import read_survey, write_survey
+from magtwin.field.survey.nodes import read_survey, write_survey
 from magtwin.usd.maps.layer import load_map, save_map
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from pxr import Sdf, Usd, UsdGeom
 
 import magtwin as mt
-from magtwin.io.surveys.maps import survey_scene
+from magtwin.twin.maps import survey_scene
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.sensors import MocapSpec
 from magtwin.usd import sensors

@@ -1,28 +1,32 @@
 """`magtwin map import`, `fit`, `validate` and `survey`: surveys to maps."""
 
 import json
-from dataclasses import dataclass, replace
+import re
+import shlex
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from magtwin.cli.maps.map import LAYERS, Earth, Kernel, Sources, headings_rad, map_app
+from magtwin.cli.maps.map import LAYERS, Earth, Kernel, Sources, earth_nt, headings_rad, map_app
 from magtwin.cli.options import Flag, Force, Jobs, Lab, Licence, Seed, Whole
 from magtwin.cli.terminal import Done, check_output, progress, step
-from magtwin.io.surveys.about import About
-from magtwin.io.surveys.columns import Columns
+from magtwin.errors import InputError
+from magtwin.io.surveys.columns import About, Columns
 from magtwin.report.report import Report
 
 COLUMNS = Columns()
+KeepStuck = Annotated[Flag, Parameter(help="Keep readings of a sensor that was stuck.")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
     """How the files of a survey are read."""
 
-    keep_stuck: Flag = False
-    """Keep readings of a sensor that was stuck."""
+    keep_stuck: KeepStuck = False
 
     pose_topic: str | None = None
     """Topic of the poses in a bag, if it has several."""
@@ -36,6 +40,28 @@ class Reading:
 AboutSurvey = Annotated[About, Parameter(name="*")]
 ReadingOptions = Annotated[Reading, Parameter(name="*")]
 ABOUT, READING = About(), Reading()
+
+_TOLD = {f.name: f"--{f.name.replace('_', '-')}" for f in (*fields(Reading), *fields(Columns))}
+"""Flags of `map import` that tell how to read a survey."""
+
+_FLAGS = "|".join(sorted(set(_TOLD.values()), key=len, reverse=True))
+_ADVICE = re.compile(rf"(?:(?:{_FLAGS}) [^\s,;()]+ ?)+")
+
+
+@contextmanager
+def _as_imported(sources: Sequence[Path]) -> Iterator[None]:
+    """Ends a refusal that names a flag of `map import` with the command to type."""
+    try:
+        yield
+    except InputError as error:
+        text = error.in_flags({k: flag for k, flag in _TOLD.items() if k != "keep_stuck"})
+        advice = _ADVICE.search(text)
+        if advice is None:
+            raise
+        told = advice.group().split()
+        out = Path(sources[0]).with_suffix(".parquet").name
+        words = ["magtwin", "map", "import", *map(str, sources), *told, "--out", out]
+        raise InputError(f"{text}; import it first: {shlex.join(words)}") from error
 
 
 @map_app.command(name="import")
@@ -77,8 +103,7 @@ def map_fit(
     earth: Earth = None,
     spacing_m: float | None = None,
     headings_deg: str | None = None,
-    about: AboutSurvey = ABOUT,
-    reading: ReadingOptions = READING,
+    keep_stuck: KeepStuck = False,
     force: Force = False,
 ) -> Done:
     """Fit a model to a survey and write its map with variance.
@@ -86,7 +111,7 @@ def map_fit(
     Parameters
     ----------
     sources
-        Readings in any format that `magtwin map import` reads, or the .parquet files that it writes.
+        The .parquet files that `magtwin map import` writes, or any readings that it reads without options.
     out
         Map layer to write (.usdc).
     method
@@ -105,19 +130,19 @@ def map_fit(
 
     check_output(out, LAYERS, "a map layer", force=force)
     angles = None if headings_deg is None else headings_rad(headings_deg)
-    with progress("Fitting" if method == "auto" else f"Fitting {method}") as advance:
+    work = "Fitting" if method == "auto" else f"Fitting {method}"
+    with _as_imported(sources), progress(work) as advance:
         report = fit_survey(
             sources,
             out,
             method=method,
             kernel=kernel,
-            earth=earth,
+            earth_nt=None if earth is None else earth_nt(earth),
             spacing_m=spacing_m,
             headings_rad=angles,
-            about=about,
+            keep_stuck=keep_stuck,
             progress=advance,
             force=force,
-            **vars(reading),
         )
     return _done(report, out)
 
@@ -141,35 +166,31 @@ def map_validate(
     split: Literal["checkerboard", "heading", "run", "block"] | None = None,
     kernel: Kernel = None,
     earth: Earth = None,
-    within_m: float | None = None,
-    reading: ReadingOptions = READING,
+    keep_stuck: KeepStuck = False,
 ) -> Done:
     """Measure how well each method predicts readings that were left out of its fit.
 
     Parameters
     ----------
     sources
-        Readings in any format that `magtwin map import` reads, or the .parquet files that it writes.
+        The .parquet files that `magtwin map import` writes, or any readings that it reads without options.
     method
         Method to validate. May be repeated. Default: all but auto.
     split
         What is left out at a time: every other node, one heading, one run, or blocks of the floor. Default:
         nodes of a gridded survey, runs if there are several, else blocks.
-    within_m
-        Count only readings this near to a reading that was fitted [m].
     """
     from magtwin.io.surveys.maps import validate_methods
 
-    with progress("Validating") as advance:
+    with _as_imported(sources), progress("Validating") as advance:
         report = validate_methods(
             sources,
             methods=method,
             split=split,
             kernel=kernel,
-            earth=earth,
-            within_m=within_m,
+            earth_nt=None if earth is None else earth_nt(earth),
+            keep_stuck=keep_stuck,
             progress=advance,
-            **vars(reading),
         )
     return Done(report)
 
@@ -230,7 +251,7 @@ def map_survey(
         Number of processes that share the headings. Default: one, with several threads.
     """
     from magtwin.files.kinds import scene_file
-    from magtwin.io.surveys.maps import survey_scene
+    from magtwin.twin.maps import survey_scene
 
     scene = scene_file(scene)
     check_output(out, (*LAYERS, ".parquet"), "a map layer, or a file of readings,", force=force)

@@ -122,7 +122,7 @@ def map_export(file: MapFile, *, out: Path, force: Force = False) -> Done:
     out
         Folder to make: 0_map.csv, 90_map.csv, ..., rows of x [m], y [m], heading [rad], field [nT].
     """
-    from magtwin.field.survey.folder import write_survey
+    from magtwin.field.survey.nodes import write_survey
     from magtwin.io.map_files import open_map
 
     return Done(wrote=tuple(write_survey(open_map(file), out, force=force)))

@@ -64,3 +64,13 @@ def headings_rad(text: str) -> list[float]:
             f"--headings-deg {text}: {count}, as some are equal (360 is 0)", RepairWarning, stacklevel=2
         )
     return [radians(h) for h in degrees]
+
+
+def earth_nt(text: str) -> tuple[float, float, float]:
+    """The Earth's field of `--earth` [nT]."""
+    from magtwin.author.earth import earth_of
+
+    try:
+        return earth_of(text)
+    except InputError as error:
+        raise InputError(str(error), parameter="earth") from error

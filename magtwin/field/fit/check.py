@@ -34,7 +34,6 @@ def check(
     methods: Sequence[str] | None = None,
     *,
     split: str | Sequence[tuple[Rows, Rows]] | None = None,
-    within_m: float | None = None,
     options: Mapping[str, Mapping[str, Any]] = FILLED,
     progress: Progress | None = None,
 ) -> Report:
@@ -50,7 +49,6 @@ def check(
             "heading": one nominal heading of a gridded survey at a time. "run": one run at a time. "block":
             every fifth block of three spacings, in five turns. Or the rows to fit and to predict of each
             turn. Default: the first of checkerboard, run and block that the survey allows.
-        within_m: Predict only readings this near to a fitted one [m].
         options: Options by name of the method.
         progress: Called as progress(done, total, what).
 
@@ -70,16 +68,9 @@ def check(
         raise InputError(f"methods of a check must be one or more, each once, got {methods}")
     check_readings(readings)
     named, turns = _turns(readings, split)
-    if within_m is not None and not within_m >= 0:
-        raise InputError(f"within_m must be 0 m or more, got {within_m!r}", parameter="within_m")
-    turns = [(train, _near(readings, train, test, within_m)) for train, test in turns]
     tested = np.concatenate([test for _, test in turns])
     if not len(tested):
-        near = "" if within_m is None else f" within {within_m:g} m of those that are fitted"
-        raise InputError(
-            f"no good reading of {readings.name!r} is left to predict{near}; widen it",
-            parameter=None if within_m is None else "within_m",
-        )
+        raise InputError(f"no good reading of {readings.name!r} is left to predict")
     figures = [
         Figure("readings predicted", len(tested), note=f"of {int(readings.good.sum())} good ones"),
         Figure("turns", len(turns), note=f"{min(len(a) for a, _ in turns)} readings fitted at least"),
@@ -101,10 +92,7 @@ def check(
             variance.append(v)
         figures += _figures(method, readings, tested, np.concatenate(mean), np.concatenate(variance), heading)
     say(steps, steps, "done")
-    metadata: dict[str, Any] = {"split": named}
-    if within_m is not None:
-        metadata["within"] = f"{within_m:g} m of a reading that was fitted"
-    return Report(f"check of {readings.name or 'survey'}", tuple(figures), metadata)
+    return Report(f"check of {readings.name or 'survey'}", tuple(figures), {"split": named})
 
 
 def shown(readings: Readings, rows: Rows) -> Readings:
@@ -166,14 +154,6 @@ def parts(readings: Readings, split: str) -> tuple[Rows, str]:
     if split == "heading":
         return readings.node[:, 0], "one heading at a time"
     return readings.node[:, 1:].sum(axis=1) % 2, "every other node at all its headings, then the others"
-
-
-def _near(readings: Readings, train: Rows, test: Rows, within_m: float | None) -> Rows:
-    if within_m is None or not len(test) or not len(train):
-        return test
-    from scipy.spatial import cKDTree
-
-    return test[cKDTree(readings.p_xy[train]).query(readings.p_xy[test])[0] <= within_m]
 
 
 def _figures(

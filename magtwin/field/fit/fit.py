@@ -143,7 +143,6 @@ def raster(
     *,
     spacing_m: float | None = None,
     headings_rad: ArrayLike | None = None,
-    extent: ArrayLike | None = None,
     progress: Progress | None = None,
 ) -> AnomalyMap:
     """The map of a model over the floor of its readings.
@@ -161,7 +160,6 @@ def raster(
         headings_rad: Headings of the layers [rad], ascending in [0, 2 pi). Default: for "trilinear" on a
             gridded survey its own; the heading of a survey with only one; else the fewest of 4 to 24 with
             almost no loss of accuracy.
-        extent: Least x, greatest x, least y, greatest y [m]. Default: that of the readings.
         progress: Called as progress(done, total, what), once per heading.
 
     The variance of a map of one drive has that of an offset, see `offset_sd_nt`.
@@ -176,7 +174,7 @@ def raster(
     say = progress or (lambda done, total, what: None)
     say(0, 1, "resolution")
     own, axes = in_own_axes(readings)
-    grid, errors = _grid(model, readings, own, axes, spacing_m, headings_rad, extent)
+    grid, errors = _grid(model, readings, own, axes, spacing_m, headings_rad)
     p, _ = grid.poses()
     values, variance = np.empty(grid.shape), np.empty(grid.shape)
     headings = grid.headings_rad
@@ -194,7 +192,7 @@ def raster(
         raise InputError(
             f"the {model.method} fit has no valid node in x {x0:g}..{x1:g}, y {y0:g}..{y1:g} m, for survey "
             f"{readings.name!r}: each is too far from a good reading, or its sd is above {MOST_DOUBT:g} of "
-            "theirs; keep the extent within the readings, and mask readings that contradict each other"
+            "theirs; mask readings that contradict each other"
         )
     read = model.method == "trilinear" and readings.grid is not None  # its nodes err independently
     return AnomalyMap(
@@ -247,21 +245,18 @@ def _grid(
     axes: SurveyAxes,
     spacing: float | None,
     headings_rad: ArrayLike | None,
-    extent: ArrayLike | None,
 ) -> tuple[Grid, dict[str, float]]:
     """Nodes of the map, and the errors of interpolation between them, by name with unit."""
     own = readings.grid if model.method == "trilinear" else None
-    if own is not None and spacing is None and extent is None:
+    if own is not None and spacing is None:
         if headings_rad is None:
             return own, {}
         return replace(own, headings_rad=tuple(np.asarray(headings_rad, float).ravel().tolist())), {}
     if headings_rad is None:
         headings_rad = own.headings_rad if own is not None else _only_heading(readings)
-    if extent is None:
-        low, high = (f(readings.p_xy[readings.good], axis=0) for f in (np.min, np.max))
-        box = (low[0], high[0], low[1], high[1])
-        extent = readings.grid.extent if readings.grid is not None else box
-    x0, x1, y0, y1 = (float(v) for v in np.asarray(extent, float))
+    low, high = (f(readings.p_xy[readings.good], axis=0) for f in (np.min, np.max))
+    box = (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
+    extent = x0, x1, y0, y1 = readings.grid.extent if readings.grid is not None else box
     if spacing is not None:
         Grid.over(extent, spacing, (0.0,))  # refuses a wrong spacing before the errors are measured
     if spacing is None and readings.grid is None and min(x1 - x0, y1 - y0) < spacing_m(own_readings) / NARROW:

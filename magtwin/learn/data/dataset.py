@@ -37,8 +37,8 @@ from magtwin.parallel import run_all
 from magtwin.report.report import Figure, Report
 from magtwin.report.summary import Summarized, Summary, listed
 from magtwin.run.arrow import run_of, table_of
-from magtwin.run.parquet import check_parquet
 from magtwin.run.run import Metadata, Run
+from magtwin.tables.parquet import check_parquet
 from magtwin.version import __version__
 
 Array = NDArray[np.float64]

@@ -7,8 +7,8 @@ from test_fit import drive
 from test_gp import survey
 
 from magtwin.field.fit import choice
-from magtwin.field.fit.choice import CANDIDATES, CHOSEN, RMSE, SCORE, choice_report, fit_auto
-from magtwin.field.fit.fit import fit, raster
+from magtwin.field.fit.choice import CANDIDATES, CHOSEN, RMSE, SCORE, fit_auto
+from magtwin.field.fit.fit import fit
 from magtwin.field.fit.methods import METHODS, FittedModel
 from magtwin.field.fit.mixture import Mixture, mixed
 
@@ -27,14 +27,12 @@ class Told(FittedModel):
 
 @pytest.fixture(scope="module")
 def chosen():
-    readings = survey()
-    heard = []
-    model = fit_auto(readings, progress=lambda done, total, what: heard.append((done, total, what)))
-    return readings, model, heard
+    readings = survey(rows=6, columns=7)
+    return readings, fit_auto(readings)
 
 
 def test_the_best_at_left_out_readings_is_fitted_to_all_of_them(chosen):
-    readings, model, _ = chosen
+    readings, model = chosen
     told = model.parameters
     names, score, rmse = told[CANDIDATES], told[SCORE], told[RMSE]
     assert {"harmonic", "harmonic, layer above", "gp poisson", "gp matern"} <= set(names)
@@ -47,37 +45,11 @@ def test_the_best_at_left_out_readings_is_fitted_to_all_of_them(chosen):
 
 
 def test_a_choice_is_repeated_to_the_last_bit(chosen):
-    readings, model, _ = chosen
+    readings, model = chosen
     again = fit_auto(readings)
     assert again.parameters == model.parameters
     for a, b in zip(*(m.predict(readings.p_xy, readings.yaw) for m in (again, model)), strict=True):
         assert_array_equal(a, b)
-
-
-def test_progress_never_goes_back_and_names_what_is_tried(chosen):
-    _, _, heard = chosen
-    done = [d for d, _, _ in heard]
-    assert done == sorted(done)
-    assert heard[-1][0] == heard[-1][1]
-    assert any(what.startswith("trying gp matern") for *_, what in heard)
-    assert any(what.startswith("fitting ") for *_, what in heard)
-
-
-def test_the_report_has_a_line_for_every_candidate(chosen):
-    _, model, _ = chosen
-    figures = {f.name: f for f in choice_report(model.parameters).figures}
-    assert figures["chosen method"].value == model.parameters[CHOSEN]
-    assert "leads the next by" in figures["chosen method"].note
-    assert "log score" in figures["held out, gp matern"].note
-    assert figures["held out, gp matern"].unit == "nT"
-    assert choice_report({}).figures == ()
-
-
-def test_a_map_keeps_the_choice(chosen):
-    readings, model, _ = chosen
-    field = raster(model, readings, spacing_m=0.25, headings_rad=(0.0, 1.5))
-    assert field.parameters[CHOSEN] == model.parameters[CHOSEN]
-    assert field.method == model.method
 
 
 def test_few_readings_get_a_harmonic_fit():
@@ -85,30 +57,6 @@ def test_few_readings_get_a_harmonic_fit():
     model = fit(readings, "auto")
     assert model.method == "harmonic"
     assert "too few readings" in model.parameters[CHOSEN]
-
-
-def test_a_drive_is_thinned_and_tested_only_near_its_readings():
-    readings = drive(3000)
-    ((rest, test),) = choice._held_out(readings)
-    assert len(rest) <= choice.MOST_FITTED
-    assert 100 < len(test) <= choice.MOST_TESTED
-
-
-def test_one_of_several_runs_is_left_out():
-    readings = drive(900).with_(run=np.repeat([0, 1, 2], 300), runs=("a", "b", "c"))
-    ((rest, test),) = choice._held_out(readings)
-    assert set(test.run) == {1}
-    assert set(rest.run) == {0, 2}
-
-
-def test_every_fifth_node_is_left_out_at_all_its_headings_twice():
-    readings = survey()
-    nodes = [set(map(tuple, test.node[:, 1:])) for _, test in choice._held_out(readings)]
-    assert len(nodes) == 2
-    assert not nodes[0] & nodes[1]
-    for (rest, test), own in zip(choice._held_out(readings), nodes, strict=True):
-        assert len(test) == 4 * len(own)
-        assert not own & set(map(tuple, rest.node[:, 1:]))
 
 
 def test_vectors_are_tried_with_and_without_directions():
@@ -126,12 +74,12 @@ def test_a_method_that_refuses_the_survey_is_left_out_of_the_choice(monkeypatch)
         raise InputError("no")
 
     monkeypatch.setitem(METHODS._loaded, "harmonic", refuse)
-    model = fit_auto(survey(), kernel="matern")
+    model = fit_auto(survey(rows=5, columns=5), kernel="matern")
     assert model.parameters[CHOSEN] == "gp matern"
     monkeypatch.setitem(METHODS._loaded, "gp", refuse)
     monkeypatch.setitem(METHODS._loaded, "trilinear", refuse)
     with pytest.raises(InputError, match="no"):
-        fit_auto(survey())
+        fit_auto(survey(rows=5, columns=5))
 
 
 def test_a_mixture_is_the_weighted_mean_with_the_sd_of_fully_correlated_errors():

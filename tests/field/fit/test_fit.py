@@ -1,7 +1,5 @@
 """The front door of all methods, and the maps that come out of it."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -87,59 +85,12 @@ def test_a_drive_becomes_a_map_that_ends_where_the_readings_do(method):
     assert np.sqrt(np.mean((field.values_nt[middle] - truth(p, yaw)[middle]) ** 2)) < 60
 
 
-@pytest.mark.parametrize("method", ["gp", "harmonic"])
-def test_a_field_that_hardly_changes_is_mapped(method):
-    flat = dataclasses.replace(drive(300), b_nt=43_000 + 1e-6 * np.arange(300.0))
-    field = raster(fit(flat, method), flat, spacing_m=0.5, headings_rad=[0.0, 3.0])
-    assert field.valid.any()
-    assert_allclose(field.values_nt[field.valid], 43_000, atol=5)  # a tenth of `FLAT_NT`
-
-
-def test_a_survey_of_one_heading_makes_a_map_of_one_layer():
-    readings = drive().with_(yaw=np.full(700, 0.5))
-    field = raster(fit(readings, "cubic"), readings, spacing_m=0.2)
-    assert_allclose(field.headings_rad, [0.5])
-
-
-def test_progress_counts_up_to_its_total():
-    said = []
-    readings = survey(rows=4, columns=4)
-    model = fit(readings, "gp", progress=lambda *step: said.append(step))
-    assert said[0][0] == 0
-    assert said[-1][0] == said[-1][1]
-    assert [s[0] for s in said] == sorted(s[0] for s in said)
-    said.clear()
-    raster(model, readings, progress=lambda *step: said.append(step))
-    assert said[-1][0] == said[-1][1]
-    assert said[-1][2] == "headings"
-
-
 def test_an_unknown_method_or_option_is_refused_with_the_near_one():
     readings = survey(rows=4, columns=4)
     with pytest.raises(InputError, match="no method 'cubik'; did you mean 'cubic'"):
         fit(readings, "cubik")
     with pytest.raises(InputError, match="no option 'fil'; did you mean 'fill'"):
         fit(readings, "trilinear", fil=True)
-
-
-def test_a_raster_off_the_readings_is_refused():
-    readings = survey(rows=4, columns=4)
-    with pytest.raises(InputError, match="keep the extent within the readings"):
-        raster(fit(readings, "cubic"), readings, extent=(50, 52, 50, 52))
-
-
-def test_readings_on_one_line_are_refused_by_the_harmonic_fit_too():
-    x = np.linspace(0, 5, 60)
-    line = Readings(p_xy=np.column_stack([x, 0 * x]), yaw=0 * x, b_nt=41_000 + 500 * np.sin(x), name="line")
-    with pytest.raises(InputError, match=r"readings of 'line' lie on one line, x 0\.\.5, y 0\.\.0 m"):
-        raster(fit(line, "harmonic"), line)
-
-
-def test_every_method_has_its_own_name():
-    readings = survey(rows=4, columns=4)
-    for method in QUICK:
-        assert fit(readings, method).method == method
-    assert set(QUICK) < set(METHODS)
 
 
 def test_a_map_has_its_surveys_frame_and_datum_and_a_height_only_where_the_survey_has_one():

@@ -182,14 +182,6 @@ def test_the_sensors_place_beside_base_link_is_found():
     assert_allclose(model.parameters["p_base_sensor_m"], [0.03, -0.02], atol=0.006)
 
 
-def test_a_whole_turn_changes_nothing_and_nan_gives_nan():
-    model = fit_gp(survey(rows=4, columns=5))
-    at = np.array([[0.1, 0.2], [-0.4, 0.3]])
-    for one, other in zip(model.predict(at, 1.0), model.predict(at, 1.0 + 2 * np.pi), strict=True):
-        assert_allclose(one, other, rtol=1e-9)
-    assert np.isnan(model.predict([[np.nan, 0.0], [0.0, 0.0]], [0.0, np.nan])).all()
-
-
 def test_one_heading_has_no_harmonics_and_holds_for_all():
     whole = survey()
     only = whole.take(whole.node[:, 0] == 0).with_(yaw=np.zeros(56))

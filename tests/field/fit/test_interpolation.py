@@ -7,7 +7,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from magtwin.errors import InputError
 from magtwin.field.fit.interpolation import fit_cubic, fit_trilinear
 from magtwin.field.grid import Grid
-from magtwin.field.survey.bins import bin_readings, spacing_m
 from magtwin.field.survey.readings import Readings
 
 FOUR = tuple(np.radians([0.0, 90.0, 180.0, 270.0]))
@@ -76,21 +75,12 @@ def test_cubic_reproduces_a_bicubic_field_between_nodes():
 
 
 def test_trilinear_agrees_with_the_maps_own_lookup():
-    from magtwin.field.survey.folder import node_map
+    from magtwin.field.survey.nodes import node_map
 
     readings = grid_survey(lambda x, y, yaw: cubic(x, y, yaw) + 300 * np.cos(yaw))
     p, yaw = points()
     mean, _ = fit_trilinear(readings).predict(p, yaw)
     assert_allclose(mean, node_map(readings).lookup(p, yaw), rtol=0, atol=ROUNDING_NT)
-
-
-@pytest.mark.parametrize("fit", [fit_trilinear, fit_cubic])
-@pytest.mark.parametrize("survey", [grid_survey, scattered])
-def test_a_whole_turn_changes_nothing(fit, survey):
-    p, yaw = points(inset=0.2)
-    model = fit(survey(wave))
-    for one, other in zip(model.predict(p, yaw), model.predict(p, yaw + 4 * np.pi), strict=True):
-        assert_allclose(one, other, rtol=1e-9, atol=ROUNDING_NT)
 
 
 def test_cubic_is_smooth_in_heading_where_the_last_layer_meets_the_first():
@@ -152,24 +142,6 @@ def test_scattered_readings_of_one_heading_have_no_wave():
     assert_array_equal(model.wave_nt, 0)
     at, yaw = points(inset=0.3)
     assert_allclose(model.predict(at, yaw)[0], linear(*at.T, yaw), rtol=0, atol=1e-3)
-
-
-def test_the_spacing_of_a_scattered_survey_is_that_of_a_grid_as_dense():
-    grid = Grid(origin_m=(0, 0), cell_m=(0.2, 0.2), headings_rad=(0.0,), rows=21, columns=31)
-    p = grid.poses()[0].reshape(-1, 2)
-    found = spacing_m(Readings(p_xy=p, yaw=np.zeros(len(p)), b_nt=np.full(len(p), 4e4)))
-    assert abs(found - 0.2) < 0.01
-
-
-def test_bins_are_means_of_what_lies_together():
-    p = np.array([[0.1, 0.1], [0.3, 0.1], [5.0, 5.0]])
-    readings = Readings(p_xy=p, yaw=[6.2, 0.1, 1.0], b_nt=[100.0, 300.0, 7.0])
-    bins, index = bin_readings(readings, 1.0)
-    assert_allclose(bins.p_xy, [[0.2, 0.1], [5, 5]])
-    assert_allclose(bins.b_nt, [200, 7])
-    assert_array_equal(bins.count, [2, 1])
-    assert_array_equal(index, [0, 0, 1])
-    assert abs(np.sin(bins.yaw[0] - (6.2 + 0.1 + 2 * np.pi) / 2)) < 1e-9
 
 
 @pytest.mark.parametrize("fit", [fit_trilinear, fit_cubic])

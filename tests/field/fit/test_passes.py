@@ -8,9 +8,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_gp import survey, truth
 
-from magtwin.field.fit.fit import OFFSET_SD_NT, fit, grid_report, offset_sd_nt, raster
+from magtwin.field.fit.fit import OFFSET_SD_NT, fit, grid_report, raster
 from magtwin.field.fit.passes import by_pass
-from magtwin.field.maps.difference import difference
 from magtwin.field.maps.map import OFFSET
 from magtwin.field.maps.statistics import map_metadata
 from magtwin.field.survey.readings import Readings
@@ -73,11 +72,6 @@ def test_the_noise_of_a_drive_is_that_between_its_passes(method):
 
 
 @pytest.mark.parametrize("method", ["gp", "harmonic"])
-def test_the_noise_of_passes_that_agree_stays_that_of_the_sensor(method):
-    assert np.sqrt(fitted(method, 0.0).noise_nt2) < 4 * WHITE_NT
-
-
-@pytest.mark.parametrize("method", ["gp", "harmonic"])
 def test_another_drive_lies_in_the_intervals_of_the_first(method):
     other, model = loops(seed=3), fitted(method)
     value, variance = model.predict(other.p_xy, other.yaw)
@@ -95,13 +89,6 @@ def test_a_map_of_one_drive_holds_an_offset_and_says_so():
         assert {f.name: f for f in report.figures}["offset sd"].value == OFFSET_SD_NT
 
 
-def test_a_survey_at_rest_several_runs_and_readings_without_times_leave_no_offset():
-    one = loops()
-    several = one.with_(run=np.arange(len(one)) // 750, runs=("a", "b"))
-    assert offset_sd_nt(one) == OFFSET_SD_NT
-    assert [offset_sd_nt(r) for r in (survey(), several, one.with_(t=None))] == [0.0, 0.0, 0.0]
-
-
 def test_a_problem_takes_the_offset_of_a_map_once_as_a_bias():
     field = raster(fitted("gp"), loops(), spacing_m=0.2)
     problem = Problem(belief=field, extent=field.extent, sensor=SensorModel(offset_nt=300.0))
@@ -110,19 +97,6 @@ def test_a_problem_takes_the_offset_of_a_map_once_as_a_bias():
         assert known.belief.offset_sd_nt == 0
     assert_allclose(problem.belief.variance_nt2, field.variance_nt2 - OFFSET_SD_NT**2)
     assert field.relative().relative() == problem.belief
-
-
-def test_changes_between_maps_are_tested_without_their_offsets():
-    field = raster(fitted("gp"), loops(), spacing_m=0.2)
-    found = difference(field, field)
-    assert found.sd_nt[np.isfinite(found.z)].max() < OFFSET_SD_NT
-
-
-@pytest.mark.parametrize("wrong", ["far", -3.0, float("nan"), float("inf"), None, [1.0]])
-def test_an_offset_that_is_none_is_not_used(wrong):
-    field = replace(raster(fitted("gp"), loops(), spacing_m=0.2), parameters={OFFSET: wrong})
-    assert field.offset_sd_nt == 0
-    assert field.relative() is field
 
 
 def test_a_fit_doubts_one_drive_and_one_that_never_comes_back():

@@ -6,8 +6,6 @@ from test_gp import survey
 
 from magtwin.field.fit.gp import fit_gp
 from magtwin.field.fit.harmonic.inversion import fit_harmonic
-from magtwin.field.fit.methods import values_of
-from magtwin.field.fit.mixture import Mixture
 from magtwin.field.fit.nodes import variance_at_nodes
 
 
@@ -30,21 +28,6 @@ def test_a_fit_that_continues_from_an_earlier_one_finds_the_same_field_in_fewer_
         off = warm.predict(whole.p_xy, whole.yaw)[0] - cold.predict(whole.p_xy, whole.yaw)[0]
         sd = np.sqrt(cold.predict(whole.p_xy, whole.yaw)[1] + cold.noise_nt2)
         assert np.sqrt(np.mean(off**2)) < 0.5 * np.mean(sd)
-
-
-def test_a_layer_above_can_be_added_to_an_earlier_fit():
-    readings, earth = survey(noise=5.0), (0.0, 2e4, -4e4)
-    below = fit_harmonic(readings, above=False, earth_nt=earth)
-    both = fit_harmonic(readings, above=True, earth_nt=earth, like=below)
-    assert min(both.layers.depths) < 0 < min(below.layers.depths)
-    assert both.parameters["dipoles"] > below.parameters["dipoles"]
-
-
-def test_values_are_those_of_the_prediction():
-    readings = survey(noise=5.0)
-    models = [fit_gp(readings), fit_harmonic(readings, above=False)]
-    for model in (*models, Mixture.of(models, (0.25, 0.75))):
-        assert_allclose(values_of(model, readings.p_xy, 0.3), model.predict(readings.p_xy, 0.3)[0], rtol=1e-9)
 
 
 def test_nodes_of_a_gaussian_process_have_its_values_and_nearly_its_sd():

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
 from magtwin.field.grid import Grid
-from magtwin.field.maps.continuation import LARGEST_STEP_DOWN, at_height
+from magtwin.field.maps.continuation import at_height
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.harmonic import HarmonicField
 
@@ -75,16 +75,6 @@ def test_a_wave_shrinks_by_exp_of_its_wavenumber_times_the_step():
     assert_allclose(inside(up, field, 1.5), inside(wave * np.exp(-0.2 * k), field, 1.5), atol=0.5)
 
 
-def test_a_small_step_down_is_the_closed_form_too():
-    sheet = a_sheet(0.3)
-    field = a_map(sheet)
-    height = HEIGHT_M - LARGEST_STEP_DOWN * 0.25
-    exact = sheet.magnitude_nt(*field.grid.poses(), height_m=height)
-    error = inside(at_height(field, height).values_nt - exact, field)
-    moved = inside(field.values_nt - exact, field)
-    assert np.sqrt(np.mean(error**2)) < 0.05 * np.sqrt(np.mean(moved**2))
-
-
 def test_a_harmonic_field_gives_every_height_exactly_and_leads_back():
     sheet = a_sheet(3.0)
     field = a_map(sheet, harmonic=sheet)
@@ -93,28 +83,6 @@ def test_a_harmonic_field_gives_every_height_exactly_and_leads_back():
         assert_array_equal(there.values_nt, sheet.magnitude_nt(*field.grid.poses(), height_m=height))
         assert there.height_m == there.harmonic.height_m == height
         assert_array_equal(at_height(there, HEIGHT_M).values_nt, field.values_nt)
-
-
-def test_the_height_that_a_map_has_is_the_map_itself():
-    field = a_map(a_sheet(1.0))
-    assert at_height(field, HEIGHT_M) is field
-
-
-def test_what_is_continued_says_so():
-    sheet = a_sheet(1.0)
-    field = a_map(sheet, parameters={"spacing_m": 0.25})
-    up = at_height(field, 0.5)
-    assert up.method == (
-        "drawn; continued from 0.35 to 0.5 m by the waves of its grid (Blakely 1995, eq. 12.8)"
-    )
-    assert up.height_m == 0.5
-    assert up.parameters["spacing_m"] == 0.25
-    assert up.parameters["continued_from_m"] == HEIGHT_M
-    spread, mean = field.values_nt.std(), field.values_nt.mean()
-    assert up.parameters["second_order_nt"] == pytest.approx(spread**2 / (2 * mean), abs=1e-3)
-    exact = at_height(replace(field, harmonic=sheet), 0.5)
-    assert exact.method == "drawn; continued from 0.35 to 0.5 m by its harmonic field"
-    assert "second_order_nt" not in exact.parameters
 
 
 def test_the_error_left_at_the_border_and_beside_masked_nodes_is_within_three_deviations():
@@ -149,16 +117,6 @@ def test_errors_of_the_readings_stay_within_the_variance_that_is_carried(step):
     common = at_height(replace(field, values_nt=field.values_nt + 10), HEIGHT_M + step).values_nt - clean
     assert_allclose(common, 10)  # an error that all nodes share does not shrink on the way
     assert np.all(common**2 < 1.0001 * carried)
-
-
-def test_no_variance_stays_unknown_and_a_harmonic_field_far_below_has_none():
-    sheet = a_sheet(1.0)
-    field = a_map(sheet, harmonic=sheet)
-    assert at_height(field, 0.5).variance_nt2 is None
-    assert at_height(a_map(sheet), 0.5).variance_nt2 is None
-    known = replace(field, variance_nt2=np.ones_like(field.values_nt))
-    assert at_height(known, 0.5).variance_nt2 is not None
-    assert at_height(known, 0.1).variance_nt2 is None
 
 
 def test_dipoles_of_a_survey_whose_height_is_unknown_are_not_taken_to_a_height_above_the_floor():

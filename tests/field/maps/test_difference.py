@@ -1,6 +1,5 @@
 """Two surveys of one floor: the bias that they share, the nodes that changed, and no others."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -172,24 +171,3 @@ def test_surveys_that_cannot_be_compared_are_refused(change, said):
     before, after = pair(height_m=0.35, frame="world", datum="the wall")
     with pytest.raises(InputError, match=said):
         difference(before, replace(after, **change))
-
-
-def test_the_report_tells_where_when_and_what_is_doubtful_and_is_json():
-    before, after = pair(created="2026-01-01", frame="world", height_m=0.35)
-    after = replace(with_a_magnet(after), created="2026-02-01", height_m=None)
-    report = difference(before, after).report()
-    assert report.title == "difference a to b"
-    assert report.metadata["from"] == "a 2026-01-01"
-    assert report.metadata["to"] == "b 2026-02-01"
-    told = {f.name: f for f in report.figures}["region 1"]
-    assert told.value == pytest.approx(933, abs=100)
-    assert told.spread == pytest.approx(NOISE_NT * np.sqrt(2))
-    assert "about (1.0" in told.note
-    assert told.note.endswith(" nodes")
-    assert report.metadata["caution"] == [
-        "height unknown in one map; assumed equal",
-        "datum unknown in both maps; assumed equal",
-    ]
-    told = json.loads(report.to_json())["figures"]["surest local change"]
-    assert "at (1, -0.5) m, heading" in told["note"]
-    assert told["spread"] == pytest.approx(NOISE_NT * np.sqrt(2))

@@ -211,23 +211,6 @@ def test_one_pose_is_refused_outside_as_many_are():
     assert math.isnan(field.at(9.0, 0.7, 0.0))
 
 
-def test_one_pose_may_be_given_in_whole_numbers_and_gives_a_plain_float():
-    field = field_map(cell=(1.0, 1.0))
-    for _ in range(2):
-        assert type(field.at(0, 1, 0)) is float
-        assert field.at(0, 1, 0) == field.at(np.float64(0), np.float32(1), 0.0)
-        warm_up()
-
-
-def test_shapes_of_gradients_are_broadcast_and_kept():
-    field = field_map()
-    assert field.gradient((0.0, 0.7), 0.0).shape == (3,)
-    assert field.gradient(np.zeros((4, 1, 2)), np.zeros(7)).shape == (4, 7, 3)
-    b, slopes = field.lookup_with_gradient(np.zeros((0, 2)), 0.0)
-    assert b.shape == (0,)
-    assert slopes.shape == (0, 3)
-
-
 def test_read_only_strided_and_single_precision_poses_are_looked_up_when_compiled():
     field = field_map()
     p, yaw = poses(field, 300)

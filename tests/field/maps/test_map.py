@@ -53,12 +53,6 @@ def test_nodes_give_their_values_whatever_the_number_of_turns():
             assert_allclose(got, field.values_nt[layer], rtol=0, atol=1e-9)
 
 
-def test_one_layer_serves_every_heading():
-    field = field_map(headings=np.array([1.2]))
-    p, yaw = poses(field, 100)
-    assert_array_equal(field.lookup(p, yaw), field.lookup(p, 0.0))
-
-
 @given(st.floats(-3, 3), st.floats(-1.75, 1.75), st.floats(-50, 50), st.integers(-4, 4), st.integers(0, 3))
 @settings(max_examples=60, deadline=None)
 def test_turning_the_layers_turns_the_lookup(x, y, yaw, turns, quarter):
@@ -74,17 +68,6 @@ def test_turning_the_layers_turns_the_lookup(x, y, yaw, turns, quarter):
     assert_allclose(got, want, rtol=0, atol=1e-8)  # 100 rad carries 1e-14 rad of rounding, times 1e4 nT/rad
 
 
-def test_shapes_are_broadcast_and_kept():
-    field = field_map()
-    assert field.lookup((0.0, 0.0), 0.0).shape == ()
-    assert field.lookup(np.zeros((2, 3, 2)), 0.0).shape == (2, 3)
-    assert field.lookup((0.0, 0.0), np.zeros((5, 1))).shape == (5, 1)
-    assert field.lookup(np.zeros((4, 1, 2)), np.zeros(7)).shape == (4, 7)
-    assert field.lookup(np.zeros((0, 2)), 0.0).shape == (0,)
-    with pytest.raises(InputError, match=r"shape \(\.\.\., 2\), got \(3,\)"):
-        field.lookup((0, 0, 0), 0.0)
-
-
 def test_outside_the_map_gives_nan_the_border_or_a_refusal():
     field = field_map(name="lab")
     p = np.array([[3.2, 0.0], [0.0, -9.0], [1.0, 1.0]])
@@ -97,15 +80,6 @@ def test_outside_the_map_gives_nan_the_border_or_a_refusal():
         field.lookup(p, 0.0, outside="raise")
     with pytest.raises(InputError, match="outside must be"):
         field.lookup(p, 0.0, outside="zero")
-
-
-@pytest.mark.parametrize("outside", ["nan", "clamp", "raise"])
-def test_nan_in_gives_nan_out_whatever_is_asked_for_outside(outside):
-    field = field_map()
-    p = np.array([[np.nan, 0], [0, np.nan], [0, 0], [0, 0], [0, 0]])
-    yaw = np.array([0, 0, np.nan, np.inf, 0])
-    got = field.lookup(p, yaw, outside=outside)
-    assert_array_equal(np.isnan(got), [True, True, True, True, False])
 
 
 def test_the_border_belongs_to_the_map_and_rounding_does_not_lose_it():

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from magtwin.errors import InputError
 from magtwin.field.maps import lookup, plane
 from magtwin.field.maps.lookup import LOOPS
 from magtwin.field.maps.plane import CLEAR_M, ERROR, HALF_M, SLOPE_ERROR, Plane
@@ -152,15 +151,3 @@ def test_threads_that_ask_at_once_are_told_the_same(room, floor):
     with ThreadPoolExecutor(4) as pool:
         got = list(pool.map(lambda rows: table.field_and_slopes_nt(floor[rows])[0], parts))
     assert_allclose(np.concatenate(got), want, rtol=1e-12, atol=1e-9)
-
-
-def test_points_that_are_none_have_no_field_and_shapes_are_refused(room):
-    p = np.array([[0.0, 0.0], [np.nan, 0.0], [0.0, np.inf], [1e9, 0.0]])
-    field, slopes = Plane(room, HEIGHT_M).field_and_slopes_nt(p)
-    assert_array_equal(np.isfinite(field).all(axis=1), [True, False, False, False])
-    assert_array_equal(np.isfinite(slopes).all(axis=(1, 2)), [True, False, False, False])
-    none, no_slopes = Plane(Bodies(), HEIGHT_M).field_and_slopes_nt(np.zeros((0, 2)))
-    assert (none.shape, no_slopes.shape) == ((0, 3), (0, 2, 3))
-    assert_array_equal(Plane(Bodies(), HEIGHT_M).field_and_slopes_nt(p[:1])[0], [[0, 0, 0]])
-    with pytest.raises(InputError, match=r"p_xy must have shape \(N, 2\), got \(3,\)"):
-        Plane(room, HEIGHT_M).field_and_slopes_nt(np.zeros(3))

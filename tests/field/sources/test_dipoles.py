@@ -2,12 +2,10 @@
 
 import magpylib as magpy
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from magtwin.errors import InputError
 from magtwin.field.sources import compiled_dipoles as dipoles
 from magtwin.field.sources import dipoles as sources
 from magtwin.field.sources.bodies import Bodies
@@ -73,19 +71,3 @@ def test_the_gradient_is_what_the_field_changes_by_along_each_axis():
     step = np.array([0, 0, 1e-5])
     pair = [dipole_field_nt(p + sign * step, place, moment) for sign in (-1, 1)]
     assert_allclose((pair[1] - pair[0])[..., 2] / 2e-5, gradient[..., 2, 2], rtol=1e-5, atol=1e-2)
-
-
-def test_no_dipoles_make_no_field_and_a_dipole_is_not_finite_where_it_is():
-    none = np.empty((0, 3))
-    field, gradient = dipole_field_and_gradient_nt(above((2, 3)), none, none)
-    assert_array_equal(field, np.zeros((2, 3, 3)))
-    assert_array_equal(gradient, np.zeros((2, 3, 3, 3)))
-    assert not np.isfinite(dipole_field_nt((1.0, 2.0, 3.0), [(1.0, 2.0, 3.0)], [(0.0, 0.0, 1.0)])).any()
-
-
-def test_shapes_that_are_no_points_or_dipoles_are_refused():
-    place, moment = below(2)
-    with pytest.raises(InputError, match=r"p_world must have shape \(\.\.\., 3\), got \(2,\)"):
-        dipole_field_nt((0.0, 1.0), place, moment)
-    with pytest.raises(InputError, match=r"one shape \(D, 3\), got \(2, 3\) and \(1, 3\)"):
-        dipole_field_nt((0.0, 1.0, 2.0), place, moment[:1])

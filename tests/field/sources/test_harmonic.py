@@ -44,13 +44,6 @@ def test_the_compiled_magnitude_is_the_plain_one_up_to_rounding(x, y, yaw):
     assert_allclose(compiled, field().magnitude_nt([x, y], yaw), rtol=1e-12)
 
 
-def test_a_field_is_equal_to_its_like_and_cannot_be_written_to():
-    assert field() == field()
-    assert field() != field(hard_iron_nt=np.zeros(3))
-    with pytest.raises(ValueError, match="read-only"):
-        field().m_world[0] = 0
-
-
 @pytest.mark.parametrize(
     ("parts", "message"),
     [

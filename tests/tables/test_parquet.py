@@ -7,7 +7,7 @@ import pytest
 
 from magtwin.errors import InputError
 from magtwin.files import budget
-from magtwin.run.parquet import _check_pages, _counts, check_parquet
+from magtwin.tables.parquet import _check_pages, _counts, check_parquet
 
 
 @pytest.fixture

@@ -1,18 +1,27 @@
-"""Parquet: what a file would take in memory, from its metadata."""
+"""Parquet: loading a file, once its metadata tell that it fits into memory."""
 
 import mmap
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.files.budget import check_count, check_decoded, check_size
+from magtwin.files.file import existing
 from magtwin.files.protobuf import varint
+
+_MAGIC = b"PAR1"
 
 _BATCH = 1 << 20
 """Most rows of texts that are measured at once."""
+
+_TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+"""Ticks per second of a timestamp of Arrow, by its unit."""
 
 _FIXED = "FIXED_LEN_BYTE_ARRAY"
 """Texts of equal length, whose length is in the metadata."""
@@ -22,6 +31,64 @@ _COUNT, _PACKED, _DATA, _DICTIONARY = 5, 7, 9, 11
 _PAGE, _PACKED_PAGE = 2, 3
 """Fields of FileMetaData, RowGroup and ColumnChunk; of ColumnMetaData; and of PageHeader, by parquet.thrift
 of Apache Parquet."""
+
+
+def _whole(path: Path) -> pa.Table:
+    with pq.ParquetFile(path) as file:  # `read_table` would import pandas
+        return file.read()
+
+
+def load_parquet(path: Path, load: Callable[[Path], Any] = _whole) -> Any:
+    """A Parquet file, loaded by a function of pyarrow.
+
+    Raises:
+        InputError: It is no regular file, does not begin and end like Parquet, or is damaged.
+    """
+    path = existing(path, "Parquet file")
+    if path.is_dir():
+        raise InputError(f"{path}: a folder, not a Parquet file; name the file in it")
+    with open(path, "rb") as file:
+        head = file.read(4)
+        file.seek(max(0, path.stat().st_size - 4))
+        tail = file.read(4)
+    if head != _MAGIC:
+        raise InputError(f"{path}: not a Parquet file: it begins with {head!r}, not {_MAGIC!r}")
+    if tail != _MAGIC:
+        raise InputError(f"{path}: Parquet cut short: its end is missing; write it again, or copy it again")
+    try:
+        check_parquet(path)
+        loaded = load(path)
+        if isinstance(loaded, pa.Table):
+            loaded.validate(full=True)  # texts that are not UTF-8 fail later otherwise
+        return loaded
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        reason = (str(error).splitlines() or [""])[0]
+        raise InputError(f"{path}: damaged Parquet ({reason}); write it again") from error
+
+
+def parquet_columns(path: Path) -> list[tuple[str, NDArray[Any]]]:
+    """Name and cells of the columns of numbers, texts and timestamps; timestamps are seconds since 1970.
+
+    Raises:
+        InputError: As for `load_parquet`; or there are no rows.
+    """
+    table = load_parquet(path)
+    columns = []
+    for field, values in zip(table.schema, table.columns, strict=True):
+        kind = field.type
+        if pa.types.is_dictionary(kind):
+            values, kind = values.cast(kind.value_type), kind.value_type
+        if pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind):
+            plain = values.cast(pa.float64(), safe=False) if values.null_count else values
+            columns.append((field.name, plain.to_numpy()))
+        elif pa.types.is_timestamp(kind):
+            since = values.cast(pa.int64()).cast(pa.float64(), safe=False)
+            columns.append((field.name, since.to_numpy() / _TICKS[kind.unit]))
+        elif pa.types.is_string(kind) or pa.types.is_large_string(kind):
+            columns.append((field.name, np.array(values.to_pylist(), object)))
+    if not columns or not table.num_rows:
+        raise InputError(f"{path}: it has no rows of numbers; expected one per reading")
+    return columns
 
 
 def check_parquet(path: Path) -> None:

@@ -1,0 +1,366 @@
+"""Tabled: the readings in a table, whose columns are known by their names, units and sizes."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.field.grid import FARTHEST_M
+from magtwin.field.survey.folder import LARGEST_TURN, USUAL_SPAN_M
+from magtwin.field.survey.readings import TAKEN, Readings
+from magtwin.field.units import NT_PER, check_unit, nt_per, unit_by_size
+from magtwin.frames import yaw_from_quat
+from magtwin.io.surveys.axes import levelled, other_axes
+from magtwin.io.surveys.columns import NO_HEADING, Columns
+from magtwin.tables.labels import is_on_earth, split_label, unit_of
+from magtwin.tables.quantities import ANGLES, DEGREES, FIELDS
+from magtwin.tables.table import Table, since_1970
+
+Array = NDArray[np.float64]
+
+LEAST_SPAN_M = 0.01
+"""Extent below which the report asks whether positions are in degrees [m]."""
+
+APART = 2.0
+"""Largest median ratio between vectors and magnitudes of the same table."""
+
+SAME_LENGTH = 0.01
+"""Largest median difference of x, y, z from the magnitude by which they are its components."""
+
+
+def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Readings:
+    """The readings in a table.
+
+    Args:
+        table: The table.
+        told: What the user told about its columns.
+        name: Name of the readings and of their run.
+        source: Its files, with checksums.
+
+    Raises:
+        InputError: A column is missing (the text has the nearest name), a cell is not a number (with file and
+            line), no unit fits, or columns contradict each other.
+    """
+    columns, taken = _complete(table, told)
+    p = np.column_stack([table.numbers(columns.x, "x"), table.numbers(columns.y, "y")])
+    turn = _turn(table, columns)
+    vector, b = _field(table, columns)
+    if turn is None and columns.heading == NO_HEADING and vector is not None and columns.axes != "world":
+        what = (
+            f"{columns.field} without {columns.vector}"
+            if columns.field
+            else f"the magnitude of {columns.vector}"
+        )
+        taken.append(f"{what}, since a sensor carried by hand has no heading")
+        vector = None
+    t = _times(table, columns, told, taken)
+    some = [p, b[:, None]] + [v.reshape(len(p), -1) for v in (turn, vector, t) if v is not None]
+    known: NDArray[np.bool_] = np.all(np.isfinite(np.hstack(some)), axis=1)
+    if not known.any():
+        text = f"no row is complete; all {len(known)} have a cell that is empty or nan"
+        raise InputError(f"{table.path}: {text}")
+    _check_places(table, columns, p, known, taken)
+    turn = _upright(table, columns, turn, vector, known)
+    _check_field(table, columns, told, p, b, known, taken)
+    if vector is not None:
+        _check_vectors(table, columns, vector[known], b[known], turn[known])
+        vector = levelled(vector, turn, columns.axes or "body")[known]
+    notes = [f"; {TAKEN}{note.replace('; ', ', ')}" for note in taken]  # "; " separates them
+    return Readings(
+        p_xy=p[known],
+        yaw=(turn if turn.ndim == 1 else yaw_from_quat(turn))[known],
+        b_nt=b[known],
+        b_body_nt=vector,
+        t=None if t is None else t[known],
+        runs=(name,),
+        name=name,
+        source=source + left_out(known) + "".join(notes),
+    )
+
+
+def left_out(known: NDArray[np.bool_]) -> str:
+    """A note on rows without a value."""
+    missing = int(np.count_nonzero(~known))
+    return f" ({missing} of {len(known)} rows without a value left out)" if missing else ""
+
+
+def _complete(table: Table, told: Columns) -> tuple[Columns, list[str]]:
+    """Columns and unit, with missing ones found by name and size; and what was found so."""
+    taken = list(table.notes)
+    columns = _placed(table, told, taken)
+    if not (columns.heading or columns.quaternion):
+        columns = replace(columns, heading="".join(table.find("heading")))
+    if columns.quaternion:
+        columns = _in_order(table, columns, taken)
+    if not columns.field and not columns.vector:
+        columns = _with_field(table, columns, taken)
+    _check_roles(table, columns)
+    if columns.heading_unit is None and columns.heading not in ("", NO_HEADING):
+        angle = table.unit(columns.heading, "heading")
+        if angle in ANGLES:
+            columns = replace(columns, heading_unit="deg" if angle in DEGREES else "rad")
+            taken.append(f"{columns.heading} in {columns.heading_unit}, by its name (--heading-unit)")
+    if columns.unit is None and columns.scale is None:
+        parts = [columns.field] if columns.field else columns.several("vector")
+        factors = {FIELDS.get(table.unit(part, "field")) for part in parts} - {None}
+        if len(factors) > 1:
+            raise InputError(f"{table.path}: the units of {columns.vector} differ; give all in one unit")
+        if factors:
+            unit: Any = next(unit for unit, factor in NT_PER.items() if factor in factors)
+            return replace(columns, unit=unit), taken
+        _, b = _field(table, replace(columns, unit="nT"))
+        unit = unit_by_size(b)
+        if unit not in (None, "nT"):
+            columns = replace(columns, unit=unit)
+            taken.append(f"{columns.field or columns.vector} in {unit}, by its size (--unit)")
+    return columns, taken
+
+
+def _placed(table: Table, told: Columns, taken: list[str]) -> Columns:
+    """Columns with those of x and y found by name; refuses latitude and longitude."""
+    used = {told.field, *told.several("vector")}
+    labels = [told.x or "".join(table.find("x", apart=used)), told.y or "".join(table.find("y", apart=used))]
+    if not (told.x or told.y):
+        labels = table.find("x", "y", apart=used) or table.find("x", "y")
+    names = [table.column(label).name for label in labels if label]
+    on_earth = list(filter(is_on_earth, names if all(labels) and labels else table.names))
+    if len(on_earth) > 1:
+        shown = " and ".join(repr(label) for label in on_earth[:2])
+        text = f"{shown} are latitude and longitude; give x,y in metres in the axes of the lab"
+        raise InputError(f"{table.path}: {text}")
+    if not labels or not all(labels):
+        raise InputError(
+            f"{table.path}: no column of x and of y {_seen(table)}; name both: --x NAME --y NAME"
+        )
+    columns = replace(told, x=labels[0], y=labels[1])
+    notes = table.taken({"x": columns.x, "y": columns.y})
+    taken += [note for note in notes if "by the units" in note]
+    if not (told.x or told.y):
+        taken += [f"{note} (--x, --y)" for note in notes if note.endswith(" as x and y")]
+    return columns
+
+
+def _with_field(table: Table, columns: Columns, taken: list[str]) -> Columns:
+    """Columns with that of the magnitude found by name, else those of the components."""
+    if found := table.find("field", apart={columns.x, columns.y}):
+        return replace(columns, field=found[0])
+    three = (
+        table.find("bx", "by", "bz")
+        or [
+            label  # X_uT, Y_uT, Z_uT
+            for axis in "xyz"
+            for label in table.names
+            if split_label(label).words[:1] == (axis,) and unit_of(label, "bx") in FIELDS
+        ]
+    )
+    if len(three) != 3:
+        advice = "name the magnitude with --field NAME, or the components with --vector BX,BY,BZ"
+        raise InputError(f"{table.path}: no column of the field {_seen(table)}; {advice}")
+    columns = replace(columns, vector=",".join(three))
+    if columns.axes is None and columns.heading != NO_HEADING:
+        taken.append(f"{columns.vector} as the field in the robot's axes, forward, left, up (--axes)")
+    return columns
+
+
+def _seen(table: Table) -> str:
+    labels = ", ".join(column.name for column in table.columns if column.name)
+    if not labels:
+        return f"(no header: name columns by number, 1 to {len(table.columns)})"
+    return f"was found by its name (columns: {labels})"
+
+
+def _in_order(table: Table, columns: Columns, taken: list[str]) -> Columns:
+    """Columns whose quaternion is xyzw, if its names end in these letters."""
+    given = columns.several("quaternion")
+    by_letter = {split_label(table.column(name).name).words[-1][-1:]: name for name in given}
+    if set(by_letter) != set("xyzw") or list(by_letter) == list("xyzw"):
+        return columns
+    ordered = ",".join(by_letter[letter] for letter in "xyzw")
+    taken.append(f"{columns.quaternion} as {ordered}, by their names (--quaternion)")
+    return replace(columns, quaternion=ordered)
+
+
+def _check_roles(table: Table, columns: Columns) -> None:
+    """Refuse a column of two roles, and x and y that are components of the field."""
+    roles = [("position", columns.x), ("position", columns.y)]
+    roles += [("time", columns.time)]
+    roles += [("heading", columns.heading)] if columns.heading != NO_HEADING else []
+    roles += [("orientation", name) for name in columns.several("quaternion")]
+    roles += [("field", name) for name in (columns.field, *columns.several("vector"))]
+    seen = dict[int, str]()
+    for role, name in roles:
+        if not name:
+            continue
+        column = table.column(name)
+        if other := seen.get(id(column)):
+            both = f"{role} twice" if other == role else f"{other} and {role} at once"
+            raise InputError(
+                f"{table.path}: column {column.name or name!r} cannot be {both}; name other columns with "
+                "--x, --y, --heading, --quaternion, --field, --vector or --time"
+            )
+        seen[id(column)] = role
+    z = next((label for label in table.names if split_label(label).words == ("z",)), "")
+    places = [split_label(table.column(name).name).words for name in (columns.x, columns.y)]
+    if not (columns.field and z) or places != [("x",), ("y",)]:
+        return
+    try:
+        length = np.linalg.norm([table.numbers(name) for name in (columns.x, columns.y, z)], axis=0)
+    except InputError:
+        return  # texts
+    b = table.numbers(columns.field)
+    known = np.isfinite(length) & (b > 0)
+    if known.any() and np.median(np.abs(length[known] / b[known] - 1)) < SAME_LENGTH:
+        raise InputError(
+            f"{table.path}: {columns.x}, {columns.y} and {z} are the components of {columns.field}, no "
+            "positions; name those with --x and --y"
+        )
+
+
+def _times(table: Table, columns: Columns, told: Columns, taken: list[str]) -> Array | None:
+    """Times [s]; None if there are none, or they cannot be read and nobody asked for them."""
+    try:
+        if name := columns.time or "".join(table.find("t")):
+            t, note = since_1970(table, name)
+            taken += [note] if note else []
+            return t
+    except InputError as error:
+        if told.time:
+            raise
+        taken.append(f"no times: {error}")
+    return None
+
+
+def _check_places(
+    table: Table, columns: Columns, p: Array, known: NDArray[np.bool_], taken: list[str]
+) -> None:
+    """Refuse positions that are too far away; a note on ones whose unit is in doubt."""
+    away = np.flatnonzero(known & (np.abs(p) > FARTHEST_M).any(axis=1))
+    if len(away):
+        row = int(away[0])
+        where = table.column(columns.x).where(row)
+        raise InputError(f"{where}: x and y are metres, within {FARTHEST_M:g} of the origin, got {p[row]}")
+    if table.unit(columns.x, "x") or table.unit(columns.y, "y"):
+        return
+    span = float(np.ptp(p[known], axis=0).max())
+    if span > USUAL_SPAN_M:
+        taken.append(
+            f"x and y in metres, over {span:,.0f} m: if these are cm, write x [cm],y [cm] in the header"
+        )
+    elif 0 < span < LEAST_SPAN_M and np.abs(p[known]).max() > 1:
+        taken.append(
+            f"x and y in metres, over {1e3 * span:.3g} mm only: if these are degrees, convert them to metres"
+        )
+
+
+def _upright(
+    table: Table, columns: Columns, turn: Array | None, vector: Array | None, known: NDArray[np.bool_]
+) -> Array:
+    """Headings, or quaternions of length 1; zeros for a sensor that was carried by hand."""
+    if turn is None:
+        if columns.heading != NO_HEADING if vector is None else columns.axes != "world":
+            none = "if the sensor was carried by hand, give --heading none"
+            if vector is not None:
+                none += "; vectors in world axes need none (--axes world)"
+            raise InputError(
+                f"{table.path}: no heading: no column is called heading, yaw, theta; {none}; else name it "
+                "with --heading or --quaternion"
+            )
+        return np.zeros(len(known))
+    if turn.ndim == 1:
+        return turn
+    length = np.linalg.norm(turn, axis=1)
+    off = np.flatnonzero(known & (np.abs(length - 1) > 0.01))
+    if len(off):
+        where = table.column(columns.several("quaternion")[0]).where(int(off[0]))
+        raise InputError(f"{where}: a quaternion's length is 1, got {length[off[0]]:.4g}")
+    return np.asarray(turn / length[:, None])
+
+
+def _check_field(
+    table: Table,
+    columns: Columns,
+    told: Columns,
+    p: Array,
+    b: Array,
+    known: NDArray[np.bool_],
+    taken: list[str],
+) -> None:
+    """Refuse magnitudes that cannot be a field; a note on a median that the Earth's field does not have."""
+    magnitude = table.column(columns.field or columns.several("vector")[0])
+    zero = np.flatnonzero(known & (b <= 0))
+    if len(zero):
+        raise InputError(f"{magnitude.where(int(zero[0]))}: a magnitude is above 0, got {b[zero[0]]:g} nT")
+    warning = check_unit(
+        b[known],
+        str(table.path),
+        magnitude.name or columns.field or columns.vector,
+        columns.unit or "nT",
+        lambda k: magnitude.where(int(np.flatnonzero(known)[k])),
+        columns.scale,
+        told=columns.unit is not None or columns.scale is not None,
+        p_xy=None if told.unit is not None or told.scale is not None else p[known],
+    )
+    taken += [warning] if warning else []
+
+
+def _check_vectors(table: Table, columns: Columns, vector: Array, b: Array, turn: Array) -> None:
+    """Refuse vectors of another size than the magnitudes, and in other axes or headings than those given."""
+    ratio = float(np.median(np.linalg.norm(vector, axis=1) / b))
+    if not 1 / APART <= ratio <= APART:
+        raise InputError(
+            f"{table.path}: {columns.vector} is {ratio:.3g} times as long as {columns.field} (median); "
+            "give both in one unit, and the components of the whole field"
+        )
+    said = columns.axes or "body"
+    best, kept = other_axes(vector, turn, said)
+    if not best:
+        return
+    they = f"{table.path}: {columns.vector} are taken to be in {said} axes, but they keep one direction"
+    if best != "mirrored":
+        raise InputError(
+            f"{they} ({100 * kept:.0f} % of them) in {best} axes, as the Earth's field does: give "
+            f"--axes {best}, or correct the headings or the order of the components"
+        )
+    turned = "give --heading-unit compass for headings clockwise from north"
+    if columns.quaternion:
+        turned = "change the signs of x, y and z of a quaternion that turns world to body"
+    elif columns.heading_unit == "compass":
+        turned = "give --heading-unit deg for headings counter-clockwise from +x"
+    body_axes = "give --axes body, and " if said == "world" else ""
+    raise InputError(
+        f"{they} ({100 * kept:.0f} % of them) if headings turn the other way, or if they are forward, "
+        f"right, down: {body_axes}{turned}, or change the signs of the second and third component in the file"
+    )
+
+
+def _turn(table: Table, columns: Columns) -> Array | None:
+    """Headings [rad], shape (N,), or quaternions xyzw, shape (N, 4); None if there is no such column."""
+    if columns.quaternion:
+        return np.column_stack([table.numbers(name) for name in columns.several("quaternion")])
+    if columns.heading in ("", NO_HEADING):
+        return None
+    name, heading = columns.heading, table.numbers(columns.heading)
+    if columns.heading_unit == "deg":
+        return np.radians(heading)
+    if columns.heading_unit == "compass":
+        return np.radians(90.0 - heading)
+    beyond = np.flatnonzero(np.abs(heading) > LARGEST_TURN)
+    if columns.heading_unit is None and len(beyond):
+        where = table.column(name).where(int(beyond[0]))
+        raise InputError(
+            f"{where}: heading {heading[beyond[0]]:g} is beyond a full turn in radians; "
+            "give --heading-unit deg (counter-clockwise from +x), compass (clockwise from north) or, if it "
+            "counts turns, rad"
+        )
+    return heading
+
+
+def _field(table: Table, columns: Columns) -> tuple[Array | None, Array]:
+    """Vectors, if there are any, and magnitudes [nT], shapes (N, 3) and (N,)."""
+    factor, names = nt_per(columns.unit, columns.scale), columns.several("vector")
+    vector = factor * np.column_stack([table.numbers(name) for name in names]) if names else None
+    return vector, factor * table.numbers(columns.field) if vector is None or columns.field else (
+        np.linalg.norm(vector, axis=1)
+    )

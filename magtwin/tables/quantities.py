@@ -1,0 +1,137 @@
+"""Quantities: the names and units by which columns are known, whatever wrote the table.
+
+One table for surveys, paths and commands. To read another word, add it here.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+LENGTHS = {
+    **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
+    "cm": 0.01,
+    "mm": 0.001,
+    "km": 1e3,
+    "ft": 0.3048,
+    "inch": 0.0254,
+}
+"""Metres per unit of length."""
+
+DEGREES = ("deg", "degree", "degrees")
+ANGLES = {**dict.fromkeys(("rad", "radian", "radians"), 1.0), **dict.fromkeys(DEGREES, math.pi / 180)}
+"""Radians per unit of angle."""
+
+TIMES = {
+    **dict.fromkeys(("s", "sec", "second", "seconds"), 1.0),
+    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), 1e-3),
+    **dict.fromkeys(("us", "usec", "microsecond", "microseconds"), 1e-6),
+    **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e-9),
+    "min": 60.0,
+    "h": 3600.0,
+}
+"""Seconds per unit of time."""
+
+FIELDS = {
+    "nt": 1.0,
+    "nanotesla": 1.0,
+    "ut": 1e3,
+    "microtesla": 1e3,
+    "t": 1e9,
+    "tesla": 1e9,
+    "mg": 1e2,
+    "milligauss": 1e2,
+    "g": 1e5,
+    "gauss": 1e5,
+}
+"""nT per unit of the magnetic field."""
+
+SPEEDS = {
+    **dict.fromkeys(("m_s", "mps", "m_s_1"), 1.0),
+    **dict.fromkeys(("mm_s", "mmps", "mm_s_1"), 1e-3),
+    **dict.fromkeys(("cm_s", "cmps", "cm_s_1"), 1e-2),
+    **dict.fromkeys(("km_h", "kmh", "kmph", "kph"), 1 / 3.6),
+}
+"""m/s per unit of speed, with a low line for the stroke."""
+
+RATES = {
+    **dict.fromkeys(("rad_s", "radps", "rad_s_1"), 1.0),
+    **dict.fromkeys(("deg_s", "degps", "dps", "deg_s_1"), math.pi / 180),
+}
+"""rad/s per unit of a turn's rate."""
+
+IN_BRACKETS = frozenset({"t", "g", "min", "h"})
+"""Units that are read in brackets only: `b_t` may be the total, and `t_min` the least."""
+
+PLACES = frozenset({"lat", "latitude", "lon", "lng", "long", "longitude"})
+"""Names of places on Earth, which are no positions in metres."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a column may hold."""
+
+    names: tuple[str, ...]
+    """Its names, the usual one first, in lower case with low lines between words. Those of one place belong
+    together in quantities of one kind, as easting and northing."""
+
+    units: Mapping[str, float]
+    """Factors to SI units or nT, by unit in lower case."""
+
+    around: frozenset[str] = frozenset()
+    """Words before or behind a name that say where it comes from."""
+
+
+_AT = frozenset(
+    ("p", "t", "pos", "position", "pose", "point", "coord", "wp", "map", "world", "base", "robot")
+)
+_SENT = frozenset(("twist", "cmd", "vel", "msg", "data", "header"))
+_VECTORS = (
+    *("b{}", "b_{}", "m{}", "mag_{}", "mag{}", "field_{}", "magnetic_field_{}", "mag_field_{}"),
+    "magnetometer_{}",
+)
+
+QUANTITIES: dict[str, Quantity] = {
+    "x": Quantity(("x", "easting", "east", "rechtswert", "e", "px", "posx", "xpos", "tx"), LENGTHS, _AT),
+    "y": Quantity(("y", "northing", "north", "hochwert", "n", "py", "posy", "ypos", "ty"), LENGTHS, _AT),
+    "heading": Quantity(("heading", "yaw", "theta"), ANGLES, _AT),
+    "t": Quantity(
+        (
+            *("t", "time", "timestamp", "stamp", "seconds_elapsed", "elapsed", "time_since_start", "times"),
+            *("seconds", "elapsed_time"),
+        ),
+        TIMES,
+        _SENT,
+    ),
+    "field": Quantity(
+        (
+            *("field", "b_nt", "scalar_mag", "magnitude", "b_measured", "b_total", "b_ut", "absolute_field"),
+            *("b", "b_tot", "btotal", "bt", "b_t", "b_mag", "b_abs", "bmag", "mag", "total", "total_field"),
+            *("mag_total", "magnetic_field", "mag_field", "tmi", "mag_tmi", "f", "feldstärke", "feldstaerke"),
+            *("gesamtfeld", "totalfeld"),
+        ),
+        FIELDS,
+    ),
+    **{f"b{axis}": Quantity(tuple(name.format(axis) for name in _VECTORS), FIELDS) for axis in "xyz"},
+    "v": Quantity(
+        (
+            *("v", "v_cmd", "cmd_v", "vx", "v_x", "linear", "linear_x", "lin", "lin_x", "lin_vel", "v_lin"),
+            *("linear_velocity", "linear_velocity_x", "linear_speed", "speed", "velocity", "vel", "vel_x"),
+            *("velocity_x", "forward", "forward_speed", "forward_velocity"),
+        ),
+        SPEEDS,
+        _SENT,
+    ),
+    "w": Quantity(
+        (
+            *("w", "w_cmd", "cmd_w", "wz", "w_z", "omega", "omega_z", "angular", "angular_z", "ang", "ang_z"),
+            *("ang_vel", "w_ang", "angular_velocity", "angular_velocity_z", "angular_speed", "yaw_rate"),
+            *("yawrate", "yaw_speed", "turn_rate", "turn", "rotation_rate"),
+        ),
+        RATES,
+        _SENT,
+    ),
+}
+"""Quantities by the symbol that programs use."""
+
+UNITS = frozenset(unit for quantity in QUANTITIES.values() for unit in quantity.units)
+"""All units."""
