@@ -23,10 +23,12 @@ An installed package can announce them as entry points instead, in the groups `m
 
 import importlib
 from collections.abc import Callable, Iterator, Mapping
-from importlib.metadata import EntryPoint, entry_points
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from magtwin.errors import InputError, find
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 T = TypeVar("T")
 C = TypeVar("C")
@@ -111,8 +113,10 @@ class Registry(Mapping[str, T]):
     def __contains__(self, name: object) -> bool:
         return name in self._builtin or name in self._loaded or name in self._entry_points()
 
-    def _entry_points(self) -> dict[str, EntryPoint]:
+    def _entry_points(self) -> dict[str, "EntryPoint"]:
         if self._installed is None:
+            from importlib.metadata import entry_points
+
             self._installed = {point.name: point for point in entry_points(group=self.group)}
         return self._installed
 

@@ -18,7 +18,7 @@ from cyclopts.exceptions import CycloptsError
 
 from magtwin.cli.options import Json, Quiet
 from magtwin.cli.progress import watched
-from magtwin.cli.settings import Environment, Settings
+from magtwin.cli.settings import Environment, Settings, is_setting
 from magtwin.cli.terminal import Done, output_mode, print_error
 from magtwin.errors import TERMINATED, CalibrationWarning, InputError, MismatchWarning, RepairWarning
 from magtwin.files.folders import allow
@@ -77,7 +77,7 @@ def main(arguments: list[str] | None = None) -> None:
             )
             sys.stdout.flush()  # a fault is reported here
     except CycloptsError as error:
-        _fail(_dashed(arguments) or _with_file(error), status=2)
+        _fail(_dashed(arguments) or _moved(arguments) or _with_file(error), status=2)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # `magtwin info ... | head`
@@ -147,6 +147,22 @@ def _dashed(arguments: list[str]) -> str:
     for word in arguments:
         if word.startswith("-") and "=" not in word and "." in word and not word[1:2].isdigit():
             return f"{word}: begins with a dash, so it is read as an option; for a file write ./{word}"
+    return ""
+
+
+MOVED = {
+    ("run", "--commands"): "--path FILE",
+    ("run", "--replay"): "--path FILE",
+    ("sweep", "--session"): "--sessions survey",
+}
+"""Options of earlier releases, by command, and what they are now."""
+
+
+def _moved(arguments: list[str]) -> str:
+    """The refusal of an option that has become another one; "" if there is none."""
+    for word in (word.partition("=")[0] for word in arguments[1:]):
+        if now := MOVED.get((arguments[0], word)):
+            return f"{word} is now {now}"
     return ""
 
 
@@ -261,7 +277,8 @@ def _flags() -> dict[str, str]:
     for command in _running:
         for argument in command.assemble_argument_collection(parse_docstring=False):
             if argument.name.startswith("--"):
-                flags[argument.name.removeprefix("--").replace("-", "_")] = argument.name
+                name = argument.name.removeprefix("--").replace("-", "_")
+                flags[name] = f"[{command.name[0]}] {name}" if is_setting(argument) else argument.name
     return flags | {name: flags[key] for name, key in ALIASES.items() if key in flags}
 
 

@@ -75,9 +75,10 @@ def output_mode(*, as_json: bool, quiet: bool) -> Iterator[None]:
     """Print JSON, or nothing, until the end of the block."""
     before = _mode.json, _mode.quiet
     _mode.json, _mode.quiet = as_json, quiet
+    watch = current()
+    watch.announces, watch.mute = not as_json, quiet
     try:
-        with current().reduced(steps=as_json or quiet, all=quiet):
-            yield
+        yield
     finally:
         _mode.json, _mode.quiet = before
 
@@ -180,8 +181,10 @@ def check_output(path: Path | None, suffixes: tuple[str, ...], what: str, *, for
 
 
 def print_report(report: Any) -> None:
-    """Print a report as tables."""
-    if not (_mode.json or _mode.quiet or sys.stdout.isatty() or os.environ.get("COLUMNS")):
+    """Print a report as tables; nothing with --json or --quiet."""
+    if _mode.json or _mode.quiet:
+        return
+    if not (sys.stdout.isatty() or os.environ.get("COLUMNS")):
         lines = _lines(report)
         if all(line.replace("±", "").isascii() and line.isprintable() for line in lines):
             print(*lines, sep="\n")  # noqa: T201

@@ -1,5 +1,6 @@
 """Outputs of a run: drive a scene, and write every file that was asked for, or none."""
 
+import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -10,14 +11,16 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from magtwin.errors import InputError
+from magtwin.files.file import existing
+from magtwin.files.kinds import RUN, kind_of
 from magtwin.files.outputs import at_once, check_free, output, transaction
-from magtwin.io.formats import format_of, format_to_write, read_run, write_run
+from magtwin.io.formats import FORMATS, format_of, format_to_write, read_run, write_run
 from magtwin.io.recorder import Recorder, Sink, in_step, partial_of
 from magtwin.path import CASES, PATHS
 from magtwin.path import Path as Planned
 from magtwin.path.room import FLOOR_M
 from magtwin.run.run import Run
-from magtwin.sim.motion.commands import Commands, read_commands
+from magtwin.sim.motion.commands import Commands, is_commands, read_commands
 from magtwin.sim.motion.drive_input import drive_input
 from magtwin.spec.plant import PlantSpec
 from magtwin.twin import Session, Twin, in_session, open_twin, room_of, scan, simulate, with_plant
@@ -44,13 +47,25 @@ class Driven:
     scans: "Scans | None" = None
 
 
+def driven_by(path: str) -> "str | Commands | Run":
+    """What a text tells a robot to drive: the name of a path, or a file of x,y, as it is; commands; or a run.
+
+    Raises:
+        InputError: The file of commands or the run cannot be read.
+    """
+    if path in (*PATHS, *CASES, "random") or not os.path.lexists(path):
+        return path
+    file = existing(path, "path file")
+    if file.is_dir() or file.suffix.lower() in {*FORMATS} - {".csv"} or kind_of(file) is RUN:
+        return read_run(file)
+    return read_commands(file) if is_commands(file) else path
+
+
 @at_once()  # what a simulation writes for itself is no output of the command
 def drive(
     scene_file: str | Path,
-    path: str = "figure8",
+    path: "str | Commands | Run" = "figure8",
     *,
-    commands: str | Path | None = None,
-    replay: str | Path | None = None,
     lab: str = "",
     map_layer: str | Path | None = None,
     network: str | Path | None = None,
@@ -70,9 +85,7 @@ def drive(
 
     Args:
         scene_file: The stage.
-        path: Path, as for `magtwin.simulate`.
-        commands: CSV of commands to drive by, in place of the path.
-        replay: Run to drive again, in place of the path.
+        path: What to drive, as from `driven_by`.
         lab: As for `magtwin.open_twin`.
         map_layer: As for `magtwin.open_twin`.
         network: As for `magtwin.open_twin`.
@@ -91,14 +104,7 @@ def drive(
     Raises:
         InputError: As for `magtwin.simulate`, or a file cannot be read.
     """
-    what: Any = path
-    if commands is not None:
-        what = read_commands(Path(commands))
-    elif replay is not None:
-        what = read_run(replay)
-        metadata = {"replay_file": Path(replay).as_posix(), **metadata}
-    elif path != "random":
-        drive_input(path)  # refuses a wrong name before the scene is opened
+    drive_input(path)  # refuses a wrong name before the scene is opened
     twin = open_twin(
         scene_file,
         lab=lab,
@@ -109,15 +115,14 @@ def drive(
         tracking_error=tracking_error,
     )
     twin = in_session(with_plant(twin, plant), session, seed=seed)
-    planned = None
-    if what is path and path != "random":
-        what = planned = drive_input(path, room_of(twin), fit=fit)
-        if isinstance(planned, Planned) and planned.placing:
-            how = _placing(planned.placing, named=str(path) in (*PATHS, *CASES))
-            report(f"Path {planned.name} is {how} to fit this floor and what stands on it")
+    what = drive_input(path, room_of(twin), fit=fit)
+    planned = what if isinstance(what, Planned) else None
+    if planned is not None and planned.placing:
+        how = _placing(planned.placing, named=path in (*PATHS, *CASES))
+        report(f"Path {planned.name} is {how} to fit this floor and what stands on it")
     if isinstance(what, Commands) and (text := what.beyond(twin.scene.robot.drive)):
         report(text)
-    report(f"Driving {getattr(planned, 'name', None) or path}")
+    report(f"Driving {getattr(what, 'name', 'random' if what == 'random' else 'as recorded')}")
     run = simulate(twin, what, seed=seed, **options).with_metadata(**metadata)
     if scans:
         report("Casting the LiDAR's rays")

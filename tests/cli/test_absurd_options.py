@@ -36,11 +36,10 @@ LOCALIZE = "localize run.npz --map lab --out new"
 @pytest.mark.parametrize(
     ("command", "option", "value", "text"),
     [
-        ("run lab --out new", "--rate-hz", "1e300", "lower --rate-hz to"),
-        ("run lab --out new", "--rate-hz", "nan", "--rate-hz of the magnetometer must be above 0"),
+        (SWEEP, "--rate-hz", "1e300", "lower --rate-hz to"),
+        (SWEEP, "--rate-hz", "nan", "--rate-hz of the magnetometer must be above 0"),
         ("run lab --out new", "--duration-s", "1e12", "or --duration-s to"),
         ("run lab --out new --duration-s 2", "--speed", "1e300", "--speed must be above 0 m/s and at most"),
-        ("run lab --out new --live", "--pace", "1e-300", "--pace must be at least 0.001"),
         ("run lab --out new", "--plant", "all:nan", "plant"),
         (SWEEP, "--duration-s", "nan", "--duration-s must be above 0 s and finite, got nan"),
         (SWEEP, "--sessions", "0", "--sessions must be a whole number from 1 up"),

@@ -116,7 +116,7 @@ def test_a_drive_at_a_terminal_is_recorded_and_leaves_the_terminal_as_it_was(tmp
     assert run["p_world_base"][-1, 0] > 0.01
     assert np.abs(run["w_cmd"]).max() == 0.25
     commands, parquet = tmp_path / "d" / "commands.csv", tmp_path / "again.parquet"
-    options = ["--network", "none", "--json", "--commands", str(commands), "--out", str(parquet)]
+    options = ["--network", "none", "--json", "--path", str(commands), "--out", str(parquet)]
     main(["run", str(lab_scene), *options])
     again = read_parquet(tmp_path / "again.parquet")
     for name in run:

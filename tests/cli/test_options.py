@@ -5,11 +5,13 @@ import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from magtwin.cli import MODULES, load, main
 from magtwin.cli.app import app
+from magtwin.cli.settings import is_setting
 from magtwin.errors import InputError
 
 
@@ -49,8 +51,8 @@ def test_help_is_complete(words, capsys):
 def test_an_option_has_one_meaning():
     """Names that meant two things in the previous release, and the commands that still have them."""
     kept = {
-        "--speed": {"run", "sweep", "ros follow"},
-        "--pace": {"run", "film", "ros sim", "ros replay"},
+        "--speed": {"run", "ros follow"},
+        "--pace": {"film", "ros sim", "ros replay"},
         "--topic": {"ros record", "ros replay"},
         "--profile": {"robot"},
         "--name": {"map import", "map fit", "map survey"},
@@ -67,7 +69,38 @@ def test_an_option_has_one_meaning():
 
 
 def _names(command):
-    return {name for argument in command.assemble_argument_collection() for name in argument.names}
+    shown = (argument for argument in command.assemble_argument_collection() if argument.show)
+    return {name for argument in shown for name in argument.names}
+
+
+@pytest.mark.parametrize(("command", "most"), [("run", 20), ("sweep", 18)])
+def test_help_is_short_and_docs_list_the_settings_that_it_leaves_out(command, most, capsys):
+    main([command, "--help"])
+    options = re.findall(r"^  (?:SCENE|--[a-z-]+)", capsys.readouterr().out, re.M)
+    assert len(options) <= most
+    docs = (Path(__file__).parents[2] / "docs" / "runs.md").read_text(encoding="utf-8")
+    for argument in ALL[command,].assemble_argument_collection():
+        if is_setting(argument) and argument.name.startswith("--"):
+            key = argument.name[2:].replace("-", "_")
+            assert re.search(rf"^\| `{key}` \| .*{command}", docs, re.M), key
+
+
+@pytest.mark.parametrize(
+    ("words", "now"),
+    [
+        ("run lab --lidar on", "`lidar = ...` below [run] in magtwin.toml, or set MAGTWIN_RUN_LIDAR"),
+        ("run lab --no-model-error", "MAGTWIN_RUN_MODEL_ERROR"),
+        ("sweep lab --keep yaw", "MAGTWIN_SWEEP_KEEP"),
+        ("run lab --commands=c.csv", "--commands is now --path FILE"),
+        ("run lab --replay r.npz", "--replay is now --path FILE"),
+    ],
+)
+def test_a_flag_that_has_moved_is_refused_with_its_new_place(words, now, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(words.split())
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert now in line
 
 
 def test_a_command_that_writes_prints_its_files_as_json_and_nothing_when_quiet(tmp_path, capfd):

@@ -15,13 +15,17 @@ from magtwin.twin import open_twin
 @pytest.fixture(scope="module")
 def written(lab_scene, tmp_path_factory):
     """Everything that one run can leave."""
+    patch = pytest.MonkeyPatch()
+    patch.setenv("MAGTWIN_RUN_USD_FPS", "0")
+    patch.setenv("MAGTWIN_RUN_OUT_UNIT", "nT")
     folder = tmp_path_factory.mktemp("all")
     arguments = ["run", str(lab_scene), "--network", "none", "--duration-s", "3", "--seed", "5", "--json"]
     files = {kind: folder / f"a{end}" for kind, end in (("rrd", ".rrd"), ("bag", ".mcap"), ("csv", ".csv"))}
     files |= {"usd": folder / "deep" / "a.usda", "parquet": folder / "a.parquet"}
     files["npz"] = folder / "a.npz"
     named = [text for file in files.values() for text in ("--out", str(file))]
-    main([*arguments, "--out", str(folder / "out"), *named, "--usd-fps", "0", "--out-unit", "nT"])
+    main([*arguments, "--out", str(folder / "out"), *named])
+    patch.undo()
     return folder, files
 
 

@@ -234,7 +234,10 @@ def deaf_address() -> str:
     return f"rerun+http://127.0.0.1:{port}/proxy"
 
 
-def test_ctrl_c_ends_a_live_run_and_keeps_what_was_driven(lab_scene, tmp_path, capsys):
+def test_ctrl_c_ends_a_live_run_and_keeps_what_was_driven(lab_scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("MAGTWIN_RUN_RATE_HZ", "50")
+    monkeypatch.setenv("MAGTWIN_RUN_VIEWER", deaf_address())
+
     def interrupt() -> None:
         while not over.wait(0.05):
             if len(list(tmp_path.glob("out/run.parquet.parts/*"))) > 1:
@@ -243,20 +246,10 @@ def test_ctrl_c_ends_a_live_run_and_keeps_what_was_driven(lab_scene, tmp_path, c
 
     over, hand = threading.Event(), threading.Thread(target=interrupt)
     hand.start()
-    arguments = [
-        "run",
-        str(lab_scene),
-        "--network",
-        "none",
-        "--duration-s",
-        "300",
-        "--rate-hz",
-        "50",
-        "--json",
-    ]
+    arguments = ["run", str(lab_scene), "--network", "none", "--duration-s", "300", "--json"]
     outputs = ["--out", str(tmp_path / "out"), "--out", str(tmp_path / "run.csv")]
     try:
-        main([*arguments, *outputs, "--viewer", deaf_address()])
+        main([*arguments, *outputs])
     finally:
         over.set()
         hand.join()
@@ -267,7 +260,7 @@ def test_ctrl_c_ends_a_live_run_and_keeps_what_was_driven(lab_scene, tmp_path, c
     assert equal(read_run(tmp_path / "run.csv"), table)
 
 
-def test_a_viewer_that_is_not_there_is_refused_before_anything_is_written(lab_scene, tmp_path, capsys):
+def test_a_viewer_that_is_not_there_is_refused_first(lab_scene, tmp_path, monkeypatch, capsys):
     arguments = [
         "run",
         str(lab_scene),
@@ -282,26 +275,31 @@ def test_a_viewer_that_is_not_there_is_refused_before_anything_is_written(lab_sc
         ("rerun+http://127.0.0.1:9/proxy", "no viewer listens there"),
         ("127.0.0.1:9", "no address of a viewer"),
     ):
+        monkeypatch.setenv("MAGTWIN_RUN_VIEWER", address)
         with pytest.raises(SystemExit):
-            main([*arguments, "--viewer", address])
+            main(arguments)
         assert said in capsys.readouterr().err.splitlines()[-1]
-    for options, said in (
-        (["--pace", "2"], "--pace is for a run that is shown"),
-        (["--live", "--pace", "0"], "--pace must be above 0"),
-        (["--live", "--viewer", "rerun+http://127.0.0.1:9/proxy"], "give one of them"),
-        (["--out-unit", "nT"], "--out-unit is for a bag"),
-        (["--usd-fps", "10"], "--usd-fps is for a USD layer"),
+    monkeypatch.delenv("MAGTWIN_RUN_VIEWER")
+    for setting, value, options, said in (
+        ("PACE", "2", [], "pace is for a run that is shown"),
+        ("PACE", "0", ["--live"], "pace must be above 0"),
+        ("VIEWER", "rerun+http://127.0.0.1:9/proxy", ["--live"], "give one of them"),
+        ("OUT_UNIT", "nT", [], "out_unit is for a bag"),
+        ("USD_FPS", "10", [], "usd_fps is for a USD layer"),
     ):
-        with pytest.raises(SystemExit):
-            main([*arguments, *options])
+        with monkeypatch.context() as patch:
+            patch.setenv(f"MAGTWIN_RUN_{setting}", value)
+            with pytest.raises(SystemExit):
+                main([*arguments, *options])
         assert said in capsys.readouterr().err.splitlines()[-1]
     assert not list(tmp_path.iterdir())
 
 
-def test_a_live_run_that_is_refused_leaves_nothing(lab_scene, tmp_path, capsys):
+def test_a_live_run_that_is_refused_leaves_nothing(lab_scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("MAGTWIN_RUN_VIEWER", deaf_address())
     far = tmp_path / "far.csv"
     far.write_text("x,y\n0,0\n50,0\n")
-    live = ["--viewer", deaf_address(), "--out", str(tmp_path / "out"), "--out", str(tmp_path / "a.mcap")]
+    live = ["--out", str(tmp_path / "out"), "--out", str(tmp_path / "a.mcap")]
     with pytest.raises(SystemExit):
         main(["run", str(lab_scene), "--network", "none", "--path", str(far), *live])
     assert "far.csv" in capsys.readouterr().err

@@ -107,7 +107,7 @@ def test_a_run_that_cannot_be_replayed_is_refused(t, x, what):
 
 def test_a_script_is_no_run_to_replay():
     script = Run({"t": np.arange(3.0)})
-    with pytest.raises(InputError, match=r"needs p_world_base, yaw or q_world_base_xyzw, and has only t; "):
+    with pytest.raises(InputError, match=r"needs p_world_base, yaw or q_world_base_xyzw, and has only t"):
         replayed(script, DRIVE)
 
 
@@ -256,11 +256,11 @@ def test_run_drives_at_random_by_commands_and_by_replay(lab_scene, tmp_path, cap
     arguments = ["run", str(lab_scene), "--network", "none", "--json"]
     once, again = tmp_path / "a.parquet", tmp_path / "b.parquet"
     main([*arguments, "--path", "random", "--duration-s", "5", "--out", str(once)])
-    main([*arguments, "--replay", str(once), "--out", str(again)])
+    main([*arguments, "--path", str(once), "--out", str(again)])
     assert_array_equal(read_parquet(once)["p_world_base"], read_parquet(again)["p_world_base"])
     (tmp_path / "c.csv").write_text("t,v,w\n0,0.5,0\n0.4,0,0\n")
     capsys.readouterr()
-    main([*arguments[:-1], "--commands", str(tmp_path / "c.csv"), "--out", str(tmp_path / "c.parquet")])
+    main([*arguments[:-1], "--path", str(tmp_path / "c.csv"), "--out", str(tmp_path / "c.parquet")])
     assert "|v| above 0.306 m/s" in capsys.readouterr().err
     run = read_parquet(tmp_path / "c.parquet")
     assert 0.05 < run["p_world_base"][-1, 0] - run["p_world_base"][0, 0] < 0.2
@@ -269,13 +269,14 @@ def test_run_drives_at_random_by_commands_and_by_replay(lab_scene, tmp_path, cap
 @pytest.mark.parametrize(
     ("options", "what"),
     [
-        (["--path", "sine", "--commands", "c.csv"], "--path and --commands"),
-        (["--path", "random", "--controller", "stanley"], "--controller stanley follows a path"),
-        (["--commands", "c.csv", "--speed", "0.1"], "--speed is for a path"),
-        (["--engine", "newton", "--replay", "r.parquet"], "--engine newton cannot"),
+        (["--path", "random"], "[run] controller stanley follows a path"),
+        (["--path", "c.csv"], "[run] controller stanley follows a path"),
     ],
 )
-def test_run_refuses_two_ways_of_driving(lab_scene, options, what, capsys):
+def test_run_refuses_a_controller_without_a_path(lab_scene, options, what, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MAGTWIN_RUN_CONTROLLER", "stanley")
+    (tmp_path / "c.csv").write_text("t,v,w\n0,0.5,0\n0.4,0,0\n")
     with pytest.raises(SystemExit):
         main(["run", str(lab_scene), *options])
     assert what in capsys.readouterr().err

@@ -280,12 +280,13 @@ def two(tmp_path_factory):
     return author_scene(replace(lab, robot=ann, path=folder / "ann.csv", others=others), folder / "scene")
 
 
-def test_run_writes_a_file_for_each_robot_and_robot_the_one_to_the_same_bits(two, tmp_path, capsys):
-    main(["run", str(two), "--out", str(tmp_path / "r.parquet"), "--rate-hz", "20", "--json"])
+def test_run_writes_a_file_for_each_robot_or_one_to_the_same_bits(two, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("MAGTWIN_RUN_RATE_HZ", "20")
+    main(["run", str(two), "--out", str(tmp_path / "r.parquet"), "--json"])
     report = json.loads(capsys.readouterr().out)
     assert {"ann: duration", "bob: duration"} <= report["figures"].keys()
     assert sorted(file.name for file in tmp_path.iterdir()) == ["r.ann.parquet", "r.bob.parquet"]
-    main(["run", str(two), "--robot", "bob", "--out", str(tmp_path / "one.parquet"), "--rate-hz", "20"])
+    main(["run", str(two), "--robot", "bob", "--out", str(tmp_path / "one.parquet")])
     whole, one = read_parquet(tmp_path / "r.bob.parquet"), read_parquet(tmp_path / "one.parquet")
     for name, values in whole.items():
         assert_array_equal(values, one[name], err_msg=name)
@@ -295,15 +296,17 @@ def test_run_writes_a_file_for_each_robot_and_robot_the_one_to_the_same_bits(two
     assert whole.metadata["nearest_robot"] == report["metadata"]["bob"]["nearest_robot"] == "ann"
 
 
-def test_meet_flag_lets_robots_drive_through_each_other(two, tmp_path, capsys):
+def test_meet_flag_lets_robots_drive_through_each_other(two, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("MAGTWIN_RUN_RATE_HZ", "20")
     (tmp_path / "through.csv").write_text("-0.4,0.5\n0.4,0.5\n")
-    options = ["run", str(two), "--robot", "ann", "--path", str(tmp_path / "through.csv"), "--rate-hz", "20"]
+    options = ["run", str(two), "--robot", "ann", "--path", str(tmp_path / "through.csv")]
     out = ["--out", str(tmp_path / "r.parquet")]
     with pytest.raises(SystemExit):
         main([*options, *out])
     assert "'ann' and 'bob' would run into each other after" in capsys.readouterr().err
     assert not (tmp_path / "r.parquet").exists()
-    main([*options, *out, "--meet", "flag"])
+    monkeypatch.setenv("MAGTWIN_RUN_MEET", "flag")
+    main([*options, *out])
     assert read_parquet(tmp_path / "r.parquet")["flag_bump"].any()
 
 
@@ -313,7 +316,7 @@ def test_meet_flag_lets_robots_drive_through_each_other(two, tmp_path, capsys):
         (["--path", "sine"], "which of ann, bob is to drive sine? name it with --robot NAME"),
         (["--robot", "bo"], "no robot 'bo'; did you mean 'bob'"),
         (["--engine", "newton"], "--engine newton drives one robot by itself"),
-        (["--live"], "--live and --viewer show one robot"),
+        (["--live"], "--live and [run] viewer show one robot"),
     ],
 )
 def test_run_refuses_what_goes_with_one_robot(two, options, said, capsys):
@@ -324,7 +327,8 @@ def test_run_refuses_what_goes_with_one_robot(two, options, said, capsys):
     assert said in capsys.readouterr().err
 
 
-def test_run_refuses_several_robots_options_where_there_is_one(lab_scene, capsys):
+def test_run_refuses_several_robots_options_where_there_is_one(lab_scene, monkeypatch, capsys):
+    monkeypatch.setenv("MAGTWIN_RUN_MEET", "flag")
     with pytest.raises(SystemExit):
-        main(["run", str(lab_scene), "--meet", "flag"])
-    assert "--meet is for several robots" in capsys.readouterr().err
+        main(["run", str(lab_scene)])
+    assert "[run] meet is for several robots" in capsys.readouterr().err
