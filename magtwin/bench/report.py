@@ -44,7 +44,7 @@ NAME = "bench"
 def report_results(
     folders: Sequence[str | os.PathLike[str]], out: str | os.PathLike[str], *, force: bool = False
 ) -> None:
-    """Write the report of results as a folder: bench.html, bench.md and bench.json.
+    """Write the report of results as a folder: bench.html, bench.json and the pictures.
 
     Args:
         folders: Folders of results of one suite.
@@ -94,7 +94,7 @@ def compare_results(
     Args:
         a: Folder of results.
         b: Folder of other results.
-        out: Page to write: .html, .md or .json. None: none.
+        out: Page to write: .html or .json. None: none.
         force: Whether to replace an existing page.
 
     Raises:

@@ -46,7 +46,6 @@ ALIASES = {
     "map_layer": "map",
     "localizers": "localizer",
     "net": "network",
-    "offsets_s": "offset_s",
     "profile": "target",
     "ridge": "penalty",
 }
@@ -77,7 +76,7 @@ def main(arguments: list[str] | None = None) -> None:
             )
             sys.stdout.flush()  # a fault is reported here
     except CycloptsError as error:
-        _fail(_dashed(arguments) or _moved(arguments) or _with_file(error), status=2)
+        _fail(_moved(arguments) or _with_file(error), status=2)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # `magtwin info ... | head`
@@ -94,8 +93,6 @@ def main(arguments: list[str] | None = None) -> None:
         if isinstance(error, MemoryError) or _TOO_LITTLE.search(str(error)):
             text = str(error).partition(" for an array")[0].partition(". Error code")[0]
             _fail(f"not enough memory{f' ({text})' if text else ''}; give less data or smaller options")
-        if isinstance(error, FileNotFoundError) and _folder_gone():
-            _fail("the working folder was removed; change to another one")
         if isinstance(error, OSError):
             from magtwin.files.outputs import FULL
 
@@ -142,14 +139,6 @@ def _allowed(arguments: list[str]) -> tuple[list[str], list[str]]:
     return others, folders
 
 
-def _dashed(arguments: list[str]) -> str:
-    """The refusal of a file whose name begins with a dash and was read as an option; "" if there is none."""
-    for word in arguments:
-        if word.startswith("-") and "=" not in word and "." in word and not word[1:2].isdigit():
-            return f"{word}: begins with a dash, so it is read as an option; for a file write ./{word}"
-    return ""
-
-
 MOVED = {
     ("run", "--commands"): "--path FILE",
     ("run", "--replay"): "--path FILE",
@@ -164,15 +153,6 @@ def _moved(arguments: list[str]) -> str:
         if now := MOVED.get((arguments[0], word)):
             return f"{word} is now {now}"
     return ""
-
-
-def _folder_gone() -> bool:
-    """Whether the working folder was removed."""
-    try:
-        Path.cwd()
-    except FileNotFoundError:
-        return True
-    return False
 
 
 def _stdout_full() -> str:

@@ -100,7 +100,7 @@ def page_of_evaluation(
 
 
 def write_evaluation(page: Page, folder: str | os.PathLike[str], *, force: bool = False) -> None:
-    """Write a report as a folder: evaluation.html, .md and .json, and the pictures of the Markdown page.
+    """Write a report as a folder: evaluation.html and .json, and its pictures.
 
     Args:
         page: The report.

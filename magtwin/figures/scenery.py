@@ -54,9 +54,8 @@ CHASE_ANGLE_DEG = 50.0
 CHASE_S = 0.7
 """Time before and after a frame over which the chase camera averages the heading [s]."""
 
-WALL_M, WALL_LENGTH_M = 0.1, 1.0
-"""Clearance of the chase camera to the ends of the lab and to objects as high as itself, and least length of
-these objects [m]. Narrower objects become a veil."""
+WALL_M = 0.1
+"""Clearance of the chase camera to the ends of the lab [m]."""
 
 TRAIL_STEP_M = 0.01
 """Step of the trail [m]."""
@@ -207,15 +206,7 @@ class Scenery:
         self.plotter.close()
 
     def frame(self, k: int, *, whole: bool = False) -> NDArray[np.uint8]:
-        """Draw frame k.
-
-        Args:
-            k: Index of the frame.
-            whole: Whether objects may hide the floor and the robot.
-
-        Returns:
-            Image, shape (height, width, 3).
-        """
+        """Draw frame k, shape (height, width, 3); objects hide the floor and the robot if `whole`."""
         for name, T_world_link in self.poses(k).items():
             self._actors[name].user_matrix = T_world_link
         quads = max(0, int(np.searchsorted(self._trail_t, self._times[k], side="right")) - 1)
@@ -303,8 +294,6 @@ class Scenery:
             self._actors[name] = self.plotter.add_mesh(joined(meshes), **style_of(False))
             self._links[name] = link
         self._everything = np.vstack([*placed, self._p]).astype(float)
-        boxes = np.array([(v.min(axis=0), v.max(axis=0)) for v in placed]).reshape(-1, 2, 3)
-        self._walls = boxes[np.ptp(boxes[..., :2], axis=1).max(axis=1) >= WALL_LENGTH_M]
 
     def _build_trail(self, run: Run, limits: tuple[float, float] | None) -> None:
         """Build the whole trail, coloured by the field; a frame shows the part driven so far."""
@@ -356,7 +345,6 @@ class Scenery:
         low, high = self._everything[:, :2].min(axis=0) + WALL_M, self._everything[:, :2].max(axis=0) - WALL_M
         p, camera = self._p[k], self.plotter.camera
         eye, back = np.array([p[0], p[1], p[2] + CHASE_UP_M]), np.array([*(-CHASE_BACK_M * ahead), 0.0])
-        back *= _free_share(eye, back, self._walls)
         camera.position = (*np.clip((eye + back)[:2], low, high), eye[2])
         camera.focal_point = (*(p[:2] + CHASE_AHEAD_M * ahead), p[2] + 0.2)
         camera.up = (0.0, 0.0, 1.0)
@@ -427,22 +415,6 @@ def _links_of(links: Mapping[str, Link], robots: Sequence[str], run: Run) -> dic
         raise InputError(f"the metadata of the run name no robot of the scene, which has {', '.join(robots)}")
     base = bases[robots.index(name)] if len(robots) == len(bases) and name in robots else bases[0]
     return {name: link for name, link in links.items() if link.base == base}
-
-
-def _free_share(p: Array, d: Array, boxes: Array) -> float:
-    """Share of a segment that is farther than `WALL_M` from all boxes, from its start on.
-
-    Args:
-        p: Start in world [m], shape (3,).
-        d: Vector from the start to the end [m], shape (3,).
-        boxes: Least and greatest corners of axis-aligned boxes [m], shape (N, 2, 3).
-    """
-    low, high = boxes[:, 0] - WALL_M, boxes[:, 1] + WALL_M
-    d = np.where(np.abs(d) < 1e-12, 1e-12, d)
-    ends = np.sort(np.stack([(low - p) / d, (high - p) / d]), axis=0)  # slab by slab
-    enters, leaves = ends[0].max(axis=1), ends[1].min(axis=1)
-    met = (enters <= leaves) & (enters > 0) & (enters < 1)
-    return float(enters[met].min()) if met.any() else 1.0
 
 
 def _steps(p_xy: Array) -> NDArray[np.intp]:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.figures.canvas import save
 from magtwin.figures.page import write_page
-from magtwin.figures.reports import NamedRun, draw_comparison, page_of_comparison, page_of_runs
+from magtwin.figures.reports import NamedRun, draw_comparison, page_of_runs
 from magtwin.files.children import run
 from magtwin.files.file import existing
 from magtwin.files.outputs import check_free
@@ -30,13 +30,12 @@ STAGES = (".usd", ".usda", ".usdc", ".usdz")
 Source = str | Path
 
 
-def view(files: Sequence[Source], *, scene: Source | None = None, offsets_s: Sequence[float] = ()) -> None:
+def view(files: Sequence[Source], *, scene: Source | None = None) -> None:
     """Show runs in the Rerun viewer, or a stage in usdview or a window, until it is closed.
 
     Args:
         files: Runs in any format, on one timeline; or one stage.
         scene: Stage to show runs in. None: the one of the metadata.
-        offsets_s: Seconds to add to the times of each of several runs.
 
     Raises:
         InputError: A file cannot be read, or there is no viewer.
@@ -46,13 +45,8 @@ def view(files: Sequence[Source], *, scene: Source | None = None, offsets_s: Seq
     paths = [shipped_or(file) for file in files]
     if not paths:
         raise InputError("name a run or a stage to view")
-    if offsets_s and (len(offsets_s) != len(paths) or len(paths) < 2):
-        raise InputError(
-            f"`offsets_s` has one value for each of several runs, got {len(offsets_s)} of {len(paths)}",
-            parameter="offsets_s",
-        )
     if len(paths) > 1:
-        _view_together(paths, scene, offsets_s or [0.0] * len(paths))
+        _view_together(paths, scene)
     elif paths[0].suffix.lower() in STAGES and not paths[0].is_dir():
         _view_stage(paths[0])
     else:
@@ -148,7 +142,7 @@ def report_runs(
 
     Args:
         runs: Runs in any format; a folder that `magtwin sweep` made stands for its runs.
-        out: Page to write (.html, .md or .json).
+        out: Page to write (.html).
         scene: Scene of the map below the paths. None: the one of each run's metadata.
         force: Whether an existing page is replaced.
         progress: Called with the number of runs done, the number in all and the current step.
@@ -174,9 +168,9 @@ def report_runs(
                 warnings.warn(f"{file}: its map is not shown: {error}", MismatchWarning, stacklevel=2)
         name = file.name if names.count(file.name) == 1 else str(file)
         named.append(NamedRun(name, run, field, planned_of(run, near=file), note))
-    pictured = out.suffix.lower() == ".html" and len(named) <= MOST_PICTURED
+    pictured = len(named) <= MOST_PICTURED
     page = page_of_runs(named, pictures=pictured, advance=lambda done: progress(done, len(named), "drawing"))
-    if out.suffix.lower() == ".html" and not pictured:
+    if not pictured:
         page = replace(page, lead=f"{page.lead} Pages of more than {MOST_PICTURED} runs have no pictures.")
     write_page(page, out, force=force)
 
@@ -189,13 +183,13 @@ def compare_files(
     out: Source | None = None,
     force: bool = False,
 ) -> Comparison:
-    """Compare two runs, and write a page or a picture of the comparison.
+    """Compare two runs, and draw the comparison.
 
     Args:
         a: First run, in any format.
         b: Second run.
         align: As for `magtwin.run.compare.compare`.
-        out: Page (.html, .md, .json) or picture (.png, .svg) to write.
+        out: Picture to draw (.png, .svg).
         force: Whether an existing output is replaced.
 
     Raises:
@@ -205,10 +199,8 @@ def compare_files(
     name_a, name_b = names_of(a, b)
     named = NamedRun(name_a, read_run(a)), NamedRun(name_b, read_run(b))
     comparison = compare(named[0].run, named[1].run, align=align)
-    if out is not None and Path(out).suffix.lower() in (".png", ".svg"):
+    if out is not None:
         save(draw_comparison(*named, comparison), out, force=force)
-    elif out is not None:
-        write_page(page_of_comparison(*named, comparison), out, force=force)
     return comparison
 
 
@@ -249,7 +241,7 @@ def _view_run(file: Path, scene: Source | None) -> None:
         show_run(run, twin_to_show(run, file, scene), file=file)
 
 
-def _view_together(files: Sequence[Path], scene: Source | None, offsets_s: Sequence[float]) -> None:
+def _view_together(files: Sequence[Path], scene: Source | None) -> None:
     from magtwin.io.rerun.file import write_comparison
     from magtwin.io.rerun.viewer import show
 
@@ -260,7 +252,7 @@ def _view_together(files: Sequence[Path], scene: Source | None, offsets_s: Seque
     twin = twin_to_show(next(iter(runs.values())), files[0], scene)
     with tempfile.TemporaryDirectory() as folder:
         rrd = Path(folder) / "runs.rrd"
-        write_comparison(runs, rrd, twin, offsets_s=dict(zip(runs, offsets_s, strict=True)))
+        write_comparison(runs, rrd, twin)
         show(rrd, source=files[0])
 
 

@@ -124,20 +124,6 @@ def test_a_drive_at_a_terminal_is_recorded_and_leaves_the_terminal_as_it_was(tmp
     assert read_commands(tmp_path / "d" / "commands.csv").rows[-1, 1] == 0.0
 
 
-def test_a_gamepad_that_is_not_there_is_refused(tmp_path, lab_scene, capsys):
-    with pytest.raises(SystemExit):
-        main(["drive", str(lab_scene), "--out", str(tmp_path / "d"), "--gamepad", str(tmp_path / "js0")])
-    assert "no such gamepad" in capsys.readouterr().err
-    assert not (tmp_path / "d").exists()
-
-
-def test_a_folder_is_no_gamepad(tmp_path, lab_scene, capsys):
-    with pytest.raises(SystemExit):
-        main(["drive", str(lab_scene), "--gamepad", str(tmp_path), "--out", str(tmp_path / "d"), "--no-live"])
-    assert f"{tmp_path}: a folder; name a gamepad in it" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
 def _drawn(client):
     """Let a viewer draw; whether it shows something."""
     client.take_screenshot(max_size=64)

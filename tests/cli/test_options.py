@@ -85,24 +85,6 @@ def test_help_is_short_and_docs_list_the_settings_that_it_leaves_out(command, mo
             assert re.search(rf"^\| `{key}` \| .*{command}", docs, re.M), key
 
 
-@pytest.mark.parametrize(
-    ("words", "now"),
-    [
-        ("run lab --lidar on", "`lidar = ...` below [run] in magtwin.toml, or set MAGTWIN_RUN_LIDAR"),
-        ("run lab --no-model-error", "MAGTWIN_RUN_MODEL_ERROR"),
-        ("sweep lab --keep yaw", "MAGTWIN_SWEEP_KEEP"),
-        ("run lab --commands=c.csv", "--commands is now --path FILE"),
-        ("run lab --replay r.npz", "--replay is now --path FILE"),
-    ],
-)
-def test_a_flag_that_has_moved_is_refused_with_its_new_place(words, now, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(words.split())
-    assert stop.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert now in line
-
-
 def test_a_command_that_writes_prints_its_files_as_json_and_nothing_when_quiet(tmp_path, capfd):
     out = tmp_path / "room.toml"
     main(["new", str(out), "--json"])
@@ -163,22 +145,6 @@ def test_doctor_lists_extras_and_how_to_install_them(capsys):
     assert {"Rerun viewer", "Vulkan", "Newton", "NVIDIA validator"} <= found["tools"].keys()
     main(["doctor"])
     assert "pip install" in capsys.readouterr().out
-
-
-def test_cheap_checks_come_first_and_say_what_to_do(lab_scene, tmp_path, capfd):
-    (tmp_path / "a.toml").touch()
-    for arguments, text in (
-        (["run", tmp_path / "a.toml"], "author it first: magtwin scene"),
-        (["run", tmp_path, "--out", "x.txt"], "unknown format of a run"),
-        (["map", "fit", "gone.csv", "--out", "x.csv"], "a map layer ends in .usdc or .usd"),
-        (["train", tmp_path, "--out", tmp_path / "x.safetensors"], "build one from the runs first"),
-        (["scene", "lab", "--map", lab_scene, "--out", tmp_path / "s"], "is no map layer"),
-    ):
-        with pytest.raises(SystemExit):
-            main([str(word) for word in arguments])
-        lines = [line for line in capfd.readouterr().err.splitlines() if not line.startswith("  ")]
-        assert len(lines) == 1
-        assert text in lines[0]
 
 
 def test_help_imports_nothing_but_what_prints_it():

@@ -65,33 +65,6 @@ def test_the_layer_names_its_scene_from_where_it_lies(written, lab_scene):
     assert Usd.Stage.Open(layer).GetDefaultPrim()
 
 
-def test_outputs_that_cannot_all_be_written_leave_none(lab_scene, tmp_path, capsys):
-    (tmp_path / "file").touch()
-    arguments = [
-        "run",
-        str(lab_scene),
-        "--network",
-        "none",
-        "--duration-s",
-        "1",
-        "--out",
-        str(tmp_path / "a.rrd"),
-    ]
-    for name, said in (
-        ("file/a.usd", "cannot be written"),
-        ("file/a.mcap", "cannot be written"),
-        ("a.txt", "unknown format of a run"),
-        ("a.json", "is read, not written"),
-        ("a.rrd", "two outputs have one name"),
-    ):
-        with pytest.raises(SystemExit):
-            main([*arguments, "--out", str(tmp_path / name)])
-        line = capsys.readouterr().err.splitlines()[-1]
-        assert said in line
-        assert ".a." not in line  # the place aside is no concern of the user's
-        assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
 def test_a_run_that_lacks_columns_is_shown_in_its_lab_all_the_same(lab_scene, tmp_path):
     twin = open_twin(lab_scene, network="none")
     t = np.arange(200) / 50

@@ -4,7 +4,6 @@ import csv
 import json
 
 import numpy as np
-import pytest
 
 from magtwin.cli import main
 from magtwin.io.tables import read_parquet
@@ -111,34 +110,3 @@ def test_the_summary_is_json_where_that_is_asked_for(lab_scene, tmp_path, capsys
     figures = json.loads(capsys.readouterr().out)["figures"]
     assert figures["runs"]["value"] == 2
     assert figures["readings"]["value"] == 2 * 135
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        (("--count", "0"), "--count must be a whole number from 1 up"),
-        (("--sessions", "0"), "--sessions must be a whole number from 1 up"),
-        (("--seed", "-1"), "--seed must be a whole number from 0 up"),
-        (("--path", "figure9"), "did you mean 'figure8'"),
-        (("--session", "survey"), "--session is now --sessions survey"),
-        ({"KEEP": "yaww"}, "did you mean 'yaw'"),
-        ({"SPEED": "0"}, "[sweep] speed must be above 0"),
-    ],
-)
-def test_what_cannot_be_driven_is_refused(lab_scene, tmp_path, monkeypatch, capsys, options, text):
-    for name in options if isinstance(options, dict) else ():
-        monkeypatch.setenv(f"MAGTWIN_SWEEP_{name}", options[name])
-    options = () if isinstance(options, dict) else options
-    with pytest.raises(SystemExit) as end:
-        main(["sweep", str(lab_scene), "--out", str(tmp_path / "set"), *SHORT, *options])
-    assert end.value.code in (1, 2)
-    assert text in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_that_exists_is_kept_unless_forced(lab_scene, tmp_path, capsys):
-    (tmp_path / "set").mkdir()
-    with pytest.raises(SystemExit):
-        main(["sweep", str(lab_scene), "--out", str(tmp_path / "set"), "--count", "1", *SHORT])
-    assert "--force" in capsys.readouterr().err
-    assert list((tmp_path / "set").iterdir()) == []

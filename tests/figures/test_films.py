@@ -15,7 +15,7 @@ from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.figures.films import LONGEST_S, film_of_run, frame_times
 from magtwin.figures.pictures import VEIL
-from magtwin.figures.scenery import WALL_M, Scenery, View, _free_share, picture_of_run
+from magtwin.figures.scenery import Scenery, View, picture_of_run
 from magtwin.files.file import shipped
 from magtwin.io.tables import write_parquet
 from magtwin.run.run import Run
@@ -115,16 +115,6 @@ def test_the_robot_is_seen_behind_a_column_in_every_frame(run, lab_scene):
             assert np.mean(veiled <= VEIL * 255 + 3) > 0.9  # but for thin posts, all edge
             far, near = (np.abs(image - bare)[on_robot].mean() for image in (solid, seen))
             assert near < 0.6 * far  # 0.30 to 0.48 seen: 0.3 but for the posts
-
-
-def test_the_camera_that_follows_stays_on_the_robots_side_of_a_wall():
-    wall = np.array([[[-1.0, -2.0, 0.0], [-0.9, 2.0, 2.5]]])
-    p = np.array([0.0, 0.0, 0.75])
-    share = _free_share(p, np.array([-1.3, 0.0, 0.0]), wall)
-    assert 1.3 * share == pytest.approx(0.9 - WALL_M)
-    assert _free_share(p, np.array([1.3, 0.0, 0.0]), wall) == 1
-    assert _free_share(p + np.array([0.0, 0.0, 2.0]), np.array([-1.3, 0.0, 0.0]), wall) == 1  # above it
-    assert _free_share(p, np.array([-1.3, 0.0, 0.0]), np.empty((0, 2, 3))) == 1
 
 
 def test_the_words_of_a_frame_are_rounded(run, lab_scene):

@@ -525,19 +525,15 @@ def test_runs_that_are_compared_stand_on_one_timeline_with_their_offsets_and_com
         read_run(tmp_path / "two.rrd")
 
 
-def test_view_shows_several_runs_with_the_offsets_that_are_given(parts, tmp_path, monkeypatch, capsys):
+def test_view_shows_several_runs(parts, tmp_path, monkeypatch):
     run, _ = parts
     for name in ("a.parquet", "b.parquet"):
         write_parquet(run, tmp_path / name)
     seen = tmp_path / "seen.rrd"
     monkeypatch.setattr("magtwin.io.rerun.viewer.show", lambda rrd, **_: shutil.copy(rrd, seen))
     files = [str(tmp_path / "a.parquet"), str(tmp_path / "b.parquet")]
-    main(["view", *files, "--offset-s", "0", "--offset-s", "1.5"])
-    assert [columns_of(seen, f"run/{name}")[0][0] for name in "ab"] == [0, 1.5e9]
-    for arguments in ([*files, "--offset-s", "1"], [files[0], "--offset-s", "1"]):
-        with pytest.raises(SystemExit):
-            main(["view", *arguments])
-        assert "--offset-s has one value for each of several runs, got 1 of " in capsys.readouterr().err
+    main(["view", *files])
+    assert [columns_of(seen, f"run/{name}")[0][0] for name in "ab"] == [0, 0]
 
 
 def test_runs_that_cannot_be_told_apart_and_offsets_of_none_are_refused(parts, tmp_path):

@@ -40,7 +40,7 @@ def evaluate(
 ) -> Done:
     """Measure the errors of models on recordings, beside the naive model and Tolles and Lawson's.
 
-    Errors are of the total field at the sensor. The report, DIR/evaluation.html, .md and .json, has Table
+    Errors are of the total field at the sensor. The report, DIR/evaluation.html and .json, has Table
     1 with intervals, and the paper's Figures 2, 5, 6 and 7 of these recordings.
 
     Parameters
@@ -125,7 +125,7 @@ def evaluate(
     curves = {name: read_curve(path) for path, name in zip(weights, short_names(weights), strict=True)}
     page = page_of_evaluation(evaluation, curves=curves, more=sections, data=data)
     write_evaluation(page, out, force=force)
-    written = f"Wrote {out}: evaluation.html, evaluation.md, evaluation.json"
+    written = f"Wrote {out}: evaluation.html, evaluation.json"
     return Done(table=lambda: _print(evaluation), text=written, data=loads(to_json(page)))
 
 

@@ -31,7 +31,6 @@ def info(file: Path, *, recorded: RecordedOptions = RECORDED) -> Done:
 def view(
     *files: Annotated[Path, Parameter(required=True)],
     scene: RunScene = None,
-    offset_s: list[float] | None = None,
 ) -> Done:
     """Show runs or a stage in a viewer until it is closed.
 
@@ -42,13 +41,11 @@ def view(
     ----------
     files
         Runs in any format that magtwin reads, or one stage.
-    offset_s
-        Seconds to add to the times of a run, given once for each of several runs, in their order.
     """
     from magtwin.figures.views import view as show
 
     with silence():
-        show(files, scene=scene, offsets_s=offset_s or ())
+        show(files, scene=scene)
     return Done()
 
 

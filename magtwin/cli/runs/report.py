@@ -30,11 +30,11 @@ def report(
     runs
         Runs in any format that magtwin reads; a folder that `magtwin sweep` made stands for all of its runs.
     out
-        Page to write: .html, which needs no other file, .md or .json.
+        Page to write (.html); it needs no other file.
     """
     from magtwin.figures.views import report_runs
 
-    check_output(out, (".html", ".md", ".json"), "a report", force=force)
+    check_output(out, (".html",), "a report", force=force)
     with progress("Reporting", "runs") as advance:
         report_runs(runs, out, scene=scene, force=force, progress=advance)
     return Done(wrote=out)
@@ -61,12 +61,12 @@ def compare(
         time: shift the clocks so that the positions agree best. path: align by distance driven, for runs of
         different speeds. none: keep the clocks.
     out
-        Page (.html, .md, .json) or picture (.png, .svg) to write: readings as recorded and aligned, the
-        distance between the runs, and both paths.
+        Picture to draw (.png, .svg): readings as recorded and aligned, the distance between the runs, and
+        both paths.
     """
     from magtwin.figures.views import compare_files, names_of
 
-    check_output(out, (".html", ".md", ".json", ".png", ".svg"), "a comparison", force=force)
+    check_output(out, (".png", ".svg"), "a comparison", force=force)
     step("Comparing the runs")
     comparison = compare_files(a, b, align=align, out=out, force=force)
     return Done(comparison, out or (), table=lambda: _print(comparison, names_of(a, b)))
