@@ -270,14 +270,6 @@ def test_a_run_that_is_told_to_end_leaves_nothing(lab_scene, tmp_path, sign, sta
     assert not list(tmp_path.iterdir())
 
 
-def test_names_are_not_markup(lab_scene, tmp_path, capsys):
-    import shutil
-
-    folder = shutil.copytree(lab_scene.parent, tmp_path / "br[red]x[")
-    main(["info", str(folder / lab_scene.name)])
-    assert "br[red]x[" in "".join(capsys.readouterr().out.split())
-
-
 def test_what_needs_more_memory_than_is_free_is_refused_before_it_is_asked_for(monkeypatch):
     from magtwin.figures.pictures import check_size
 

@@ -106,7 +106,7 @@ def test_a_drive_at_a_terminal_is_recorded_and_leaves_the_terminal_as_it_was(tmp
     assert not termios.tcgetattr(theirs)[3] & termios.ICANON  # keys come one by one
     for key in (b"w", b"w", b"\x1b[D", end):
         os.write(ours, key)
-        time.sleep(1.0)  # the loop reads one key after the other also on a busy machine
+        time.sleep(0.4)  # the loop reads one key after the other also on a busy machine
     _, error = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, error
     assert termios.tcgetattr(theirs) == before

@@ -48,26 +48,6 @@ def test_help_is_complete(words, capsys):
             assert argument.parameter.help or argument.children, (words, argument.names)
 
 
-def test_an_option_has_one_meaning():
-    """Names that meant two things in the previous release, and the commands that still have them."""
-    kept = {
-        "--speed": {"run", "ros follow"},
-        "--pace": {"film", "ros sim", "ros replay"},
-        "--topic": {"ros record", "ros replay"},
-        "--profile": {"robot"},
-        "--name": {"map import", "map fit", "map survey"},
-        "--robot": {"run"},
-        "--against": {"validate"},
-        "--align": {"compare"},
-        "--duration": set(),
-        "--net": set(),
-        "--what": set(),
-    }
-    for option, expected in kept.items():
-        having = {" ".join(w) for w, sub in ALL.items() if option in _names(sub)}
-        assert having == expected, option
-
-
 def _names(command):
     shown = (argument for argument in command.assemble_argument_collection() if argument.show)
     return {name for argument in shown for name in argument.names}
@@ -96,25 +76,6 @@ def test_a_command_that_writes_prints_its_files_as_json_and_nothing_when_quiet(t
     with pytest.raises(SystemExit):
         main(["new", str(out), "--quiet"])
     assert "exists already" in capfd.readouterr().err
-
-
-def test_quiet_runs_print_nothing_and_still_write(lab_scene, tmp_path, capfd):
-    out = tmp_path / "a.npz"
-    main(
-        [
-            "run",
-            str(lab_scene),
-            "--magnetometer",
-            "physical",
-            "--duration-s",
-            "1",
-            "--out",
-            str(out),
-            "--quiet",
-        ]
-    )
-    assert capfd.readouterr() == ("", "")
-    assert out.is_file()
 
 
 def test_a_refusal_names_flags_in_place_of_parameters(monkeypatch, tmp_path, capsys):

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from magtwin.errors import InputError
-from magtwin.figures.pictures import BACKGROUND, BAR_SHARE, VEIL, Camera, picture_of_stage, view_distance
-from magtwin.files.file import shipped
+from magtwin.figures.pictures import BACKGROUND, VEIL, Camera, picture_of_stage, view_distance
 from magtwin.usd.geometry import srgb_from_linear
 from magtwin.usd.info import info_of_stage
 
@@ -146,33 +145,6 @@ def test_no_wall_or_column_hides_the_map_from_any_side(
     assert changed[0].max() <= VEIL * 255 + 3
     there = ~drawn(bare)
     np.testing.assert_allclose(veiled[there], solid[there], atol=8)  # solid elsewhere; drawn() sees from 8 on
-
-
-def test_a_camera_that_fits_a_map_keeps_it_clear_of_the_colour_bar(stage, tmp_path):
-    heat_map(stage, [(0.9, 0.05, 0.0), (0.0, 0.05, 0.9)])
-    barred = draw(stage, tmp_path, camera=Camera(azimuth_deg=-90, elevation_deg=90))
-    blue = (barred[..., 2] > 200) & (barred[..., 0] < 60)  # no colour of viridis
-    columns = np.flatnonzero(blue.any(axis=0))
-    assert columns.size
-    assert columns.max() < (1 - BAR_SHARE) * SIZE[0]
-
-
-def test_a_stage_with_a_map_gets_its_colour_bar(stage, tmp_path):
-    heat_map(stage, [(0.5, 0.1, 0.0), (0.0, 0.1, 0.5)])
-    camera = Camera(azimuth_deg=-90, elevation_deg=90)
-    plain = drawn(draw(stage, tmp_path, camera=camera, legend=False))
-    barred = drawn(draw(stage, tmp_path, camera=camera))
-    right = slice(int(0.9 * SIZE[0]), None)
-    assert not plain[:, right].any()
-    assert barred[:, right].sum() > 100
-
-
-def test_the_turtlebot_is_drawn(tmp_path):
-    out = picture_of_stage(shipped("robots", "turtlebot4", "turtlebot4.usda"), tmp_path / "r.png", size=SIZE)
-    image = pixels(out)
-    blue = (image[..., 2] > image[..., 0] + 60) & (image[..., 2] > 90)
-    assert blue.sum() > 20  # the magnetometer's head
-    assert 0.1 < drawn(image).mean() < 0.6
 
 
 @given(
