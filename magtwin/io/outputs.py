@@ -3,7 +3,7 @@
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from magtwin.errors import InputError
 from magtwin.files.file import existing
-from magtwin.files.kinds import RUN, kind_of
+from magtwin.files.kinds import COMMANDS, RUN, kind_of
 from magtwin.files.outputs import at_once, check_free, output, transaction
 from magtwin.io.formats import FORMATS, format_of, format_to_write, read_run, write_run
 from magtwin.io.recorder import Recorder, Sink, in_step, partial_of
-from magtwin.path import CASES, PATHS
+from magtwin.path import CASES, PATHS, read_path_csv
 from magtwin.path import Path as Planned
 from magtwin.path.room import FLOOR_M
 from magtwin.run.run import Run
-from magtwin.sim.motion.commands import Commands, is_commands, read_commands
+from magtwin.sim.motion.commands import Commands, read_commands
 from magtwin.sim.motion.drive_input import drive_input
 from magtwin.spec.plant import PlantSpec
 from magtwin.twin import Session, Twin, in_session, open_twin, room_of, scan, simulate, with_plant
@@ -50,15 +50,26 @@ class Driven:
 def driven_by(path: str) -> "str | Commands | Run":
     """What a text tells a robot to drive: the name of a path, or a file of x,y, as it is; commands; or a run.
 
+    A file with a header t,v,w holds commands, as does one that is no path and can be read as commands.
+
     Raises:
-        InputError: The file of commands or the run cannot be read.
+        InputError: The file is none of these.
     """
     if path in (*PATHS, *CASES, "random") or not os.path.lexists(path):
         return path
     file = existing(path, "path file")
-    if file.is_dir() or file.suffix.lower() in {*FORMATS} - {".csv"} or kind_of(file) is RUN:
+    kind = kind_of(file)
+    if file.is_dir() or file.suffix.lower() in {*FORMATS} - {".csv"} or kind is RUN:
         return read_run(file)
-    return read_commands(file) if is_commands(file) else path
+    if kind is COMMANDS:
+        return read_commands(file)
+    try:
+        read_path_csv(file)
+    except InputError:
+        with suppress(InputError):
+            return read_commands(file)
+        raise
+    return path
 
 
 @at_once()  # what a simulation writes for itself is no output of the command

@@ -153,17 +153,6 @@ def read_commands(file: str | os.PathLike[str]) -> Commands:
     return Commands(file.name, np.array(rows), file.as_posix())
 
 
-def is_commands(file: str | os.PathLike[str]) -> bool:
-    """Whether a text file holds commands: names t, v and w but not x and y, or has three columns."""
-    try:
-        text = read_delimited(expected(file, "file of commands"), "file of commands", "text", HEADER).named()
-    except InputError:
-        return False
-    roles = {_meaning(name)[0] for name in text.names}
-    is_path = {("x",), ("y",)} <= {split_label(name)[0] for name in text.names}
-    return (roles >= set(COLUMNS) and not is_path) if text.names else text.width == len(COLUMNS)
-
-
 def _columns(text: Delimited, notes: list[str]) -> tuple[tuple[int, ...], tuple[float, ...]]:
     """Columns of t, v and w, and their factors to SI, 0 for a time without a unit; `notes` gets the rest."""
     if not text.names:
