@@ -63,7 +63,6 @@ def diagnose() -> dict[str, Any]:
     vulkan = ", ".join(drivers) if find_library("vulkan") else ""
     tools = (
         ("Rerun viewer", shutil.which("rerun"), "pip install rerun-sdk"),
-        ("usdview", shutil.which("usdview"), "a build of OpenUSD; magtwin view opens a window without it"),
         ("Vulkan", vulkan, "apt install mesa-vulkan-drivers libvulkan1; pictures of recordings need it"),
         ("Newton", _version("newton"), "pip install 'magtwin[physics]'"),
         ("ROS 2, rclpy", find_spec("rclpy") and "installed", "source a ROS 2 installation"),

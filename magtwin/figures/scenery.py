@@ -46,17 +46,6 @@ Array = NDArray[np.float64]
 ORBIT_DEG_S = 5.0
 """Angular speed of the orbit camera in the film [deg/s]."""
 
-CHASE_BACK_M, CHASE_UP_M, CHASE_AHEAD_M = 1.3, 0.75, 0.3
-"""Position of the chase camera behind and above the robot, and of its target ahead of the robot [m]."""
-
-CHASE_ANGLE_DEG = 50.0
-
-CHASE_S = 0.7
-"""Time before and after a frame over which the chase camera averages the heading [s]."""
-
-WALL_M = 0.1
-"""Clearance of the chase camera to the ends of the lab [m]."""
-
 TRAIL_STEP_M = 0.01
 """Step of the trail [m]."""
 
@@ -79,7 +68,7 @@ class View:
     """A camera for a run."""
 
     kind: str
-    """"top", "orbit", "chase", or "fixed"."""
+    """"top", "orbit", or "fixed"."""
 
     place: Vec3 = (0.0, 0.0, 0.0)
     """Position of a fixed camera [m]."""
@@ -89,7 +78,7 @@ class View:
 
     @classmethod
     def of(cls, text: str) -> "View":
-        """The view that a text names: top, orbit, chase, or `x,y,z:x,y,z`, place and target in world [m].
+        """The view that a text names: top, orbit, or `x,y,z:x,y,z`, place and target in world [m].
 
         Raises:
             InputError: The text names no view.
@@ -113,7 +102,7 @@ class View:
         return cls("fixed", (x, y, z), (tx, ty, tz))
 
     def camera(self, seen_s: float = 0.0) -> Camera:
-        """The camera over a lab, `seen_s` [s] into the film. The chase view starts like orbit."""
+        """The camera over a lab, `seen_s` [s] into the film."""
         if self.kind == "top":
             return Camera(azimuth_deg=-90.0, elevation_deg=90.0)
         if self.kind == "fixed":
@@ -129,8 +118,8 @@ class View:
         return Camera(azimuth_deg=40.0 + ORBIT_DEG_S * seen_s, elevation_deg=LAB_ELEVATION_DEG)
 
 
-KINDS = ("orbit", "top", "chase")
-"""From above at a slant, slowly round the lab; straight from above, x to the right; behind the robot."""
+KINDS = ("orbit", "top")
+"""From above at a slant, slowly round the lab; straight from above, x to the right."""
 
 
 class Scenery:
@@ -332,24 +321,10 @@ class Scenery:
             self._ribbons.append((mesh, actor, faces))
 
     def _aim(self, k: int) -> None:
-        if self._view.kind != "chase":
-            seen_s = (self._times[k] - self._times[0]) / self._speed
-            camera, around = self._view.camera(seen_s), self._around
-            if self._view.kind == "top":  # with the whole map, like a picture of the stage
-                around = np.vstack([around, *self._subjects])
-            aim(self.plotter, camera, around, self._size, bar=self._bar)
-            return
-        near = np.abs(self._times - self._times[k]) <= CHASE_S * self._speed
-        ahead = matrix_from_quat(self._q[near])[:, :2, 0].mean(axis=0)
-        ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
-        low, high = self._everything[:, :2].min(axis=0) + WALL_M, self._everything[:, :2].max(axis=0) - WALL_M
-        p, camera = self._p[k], self.plotter.camera
-        eye, back = np.array([p[0], p[1], p[2] + CHASE_UP_M]), np.array([*(-CHASE_BACK_M * ahead), 0.0])
-        camera.position = (*np.clip((eye + back)[:2], low, high), eye[2])
-        camera.focal_point = (*(p[:2] + CHASE_AHEAD_M * ahead), p[2] + 0.2)
-        camera.up = (0.0, 0.0, 1.0)
-        camera.view_angle = CHASE_ANGLE_DEG
-        self.plotter.renderer.ResetCameraClippingRange()
+        camera, around = self._view.camera((self._times[k] - self._times[0]) / self._speed), self._around
+        if self._view.kind == "top":  # with the whole map, like a picture of the stage
+            around = np.vstack([around, *self._subjects])
+        aim(self.plotter, camera, around, self._size, bar=self._bar)
 
 
 def picture_of_run(
@@ -369,7 +344,7 @@ def picture_of_run(
         scene_file: Stage of its lab.
         out: PNG to write.
         time_s: Time on the run's clock [s]. Default: the end of the run.
-        camera: "top", "orbit", "chase" or "x,y,z:x,y,z", as for `View.of`.
+        camera: "top", "orbit" or "x,y,z:x,y,z", as for `View.of`.
         size: Width and height [pixel].
         force: Whether to replace an existing file.
 

@@ -1,6 +1,5 @@
 """Views of files: show, draw or film a run or a stage; a page about runs; two runs compared."""
 
-import shutil
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
@@ -12,7 +11,6 @@ from magtwin.errors import InputError, MismatchWarning
 from magtwin.figures.canvas import save
 from magtwin.figures.page import write_page
 from magtwin.figures.reports import NamedRun, draw_comparison, page_of_runs
-from magtwin.files.children import run
 from magtwin.files.file import existing
 from magtwin.files.outputs import check_free
 from magtwin.io.convert import twin_to_show
@@ -31,7 +29,7 @@ Source = str | Path
 
 
 def view(files: Sequence[Source], *, scene: Source | None = None) -> None:
-    """Show runs in the Rerun viewer, or a stage in usdview or a window, until it is closed.
+    """Show runs in the Rerun viewer, or a stage in a window, until it is closed.
 
     Args:
         files: Runs in any format, on one timeline; or one stage.
@@ -68,7 +66,7 @@ def picture(
     Args:
         file: Run in any format, stage, or recording.
         out: PNG to write.
-        camera: "orbit", "top", "chase" or "x,y,z:x,y,z" [m]. None: orbit; a recording uses the Rerun viewer.
+        camera: "orbit", "top" or "x,y,z:x,y,z" [m]. None: orbit; a recording uses the Rerun viewer.
         time_s: Moment of a run or recording [s]. None: its end, or where the viewer starts.
         size: Width and height [pixels].
         scene: Scene of a run. None: the one of the metadata.
@@ -91,8 +89,6 @@ def picture(
 
         return screenshot(file, out, time_s=time_s, size=size, force=force)
     if file.suffix.lower() in STAGES and time_s is None and scene is None:
-        if camera == "chase":
-            raise InputError(f"{file}: a stage has no run to follow; take another camera", parameter="camera")
         seen = None if camera is None else View.of(camera).camera()
         picture_of_stage(file, out, size=size, camera=seen, force=force)
     else:
@@ -260,11 +256,7 @@ def _view_stage(file: Path) -> None:
     from magtwin.usd.animation import is_animation
 
     existing(file, "stage")
-    if usdview := shutil.which("usdview"):
-        result = run([usdview, str(file)], capture_output=False)
-        if result.returncode:
-            raise InputError(f"{file}: usdview ended with status {result.returncode}")
-    elif file.suffix.lower() != ".usdz" and is_animation(file):
+    if file.suffix.lower() != ".usdz" and is_animation(file):
         _view_run(file, file)
     else:
         from magtwin.figures.pictures import show_stage

@@ -36,6 +36,9 @@ GROWING = (".rrd", ".parquet", ".mcap", "")
 
 USD = (".usd", ".usda", ".usdc")
 
+OPENING = ("lab", "map_layer", "network", "magnetometer", "model_error", "tracking_error")
+"""Options of `magtwin.open_twin`."""
+
 
 @dataclass(frozen=True)
 class Driven:
@@ -77,12 +80,6 @@ def drive(
     scene_file: str | Path,
     path: "str | Commands | Run" = "figure8",
     *,
-    lab: str = "",
-    map_layer: str | Path | None = None,
-    network: str | Path | None = None,
-    magnetometer: Literal["physical", "neural", "map-only"] | None = None,
-    model_error: bool = True,
-    tracking_error: bool = True,
     seed: int = 0,
     session: Session | None = None,
     plant: PlantSpec | str | None = None,
@@ -97,12 +94,6 @@ def drive(
     Args:
         scene_file: The stage.
         path: What to drive, as from `driven_by`.
-        lab: As for `magtwin.open_twin`.
-        map_layer: As for `magtwin.open_twin`.
-        network: As for `magtwin.open_twin`.
-        magnetometer: As for `magtwin.open_twin`.
-        model_error: As for `magtwin.open_twin`.
-        tracking_error: As for `magtwin.open_twin`.
         seed: Seed of all noise.
         session: As for `magtwin.simulate`.
         plant: As for `magtwin.simulate`.
@@ -110,21 +101,13 @@ def drive(
         scans: Whether the LiDAR's rays are cast.
         metadata: Metadata of the run, such as names of files that move with it.
         report: Called with a line about each step.
-        options: Of `magtwin.simulate`.
+        options: Of `magtwin.open_twin` and `magtwin.simulate`.
 
     Raises:
         InputError: As for `magtwin.simulate`, or a file cannot be read.
     """
     drive_input(path)  # refuses a wrong name before the scene is opened
-    twin = open_twin(
-        scene_file,
-        lab=lab,
-        map_layer=map_layer,
-        network=network,
-        magnetometer=magnetometer,
-        model_error=model_error,
-        tracking_error=tracking_error,
-    )
+    twin = open_twin(scene_file, **{name: options.pop(name) for name in OPENING if name in options})
     twin = in_session(with_plant(twin, plant), session, seed=seed)
     what = drive_input(path, room_of(twin), fit=fit)
     planned = what if isinstance(what, Planned) else None

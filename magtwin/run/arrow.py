@@ -25,14 +25,6 @@ from magtwin.run.run import COLUMNS, Column, Metadata, Run, check_clock
 FACTS = b"magtwin_facts"
 
 
-class _NoPandas:
-    """A finder of modules that finds no pandas."""
-
-    def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
-        if name == "pandas":
-            raise ImportError("magtwin.run.arrow.without_pandas")
-
-
 @contextmanager
 def without_pandas() -> Iterator[None]:
     """Keep pyarrow from importing pandas, for a third of a second, in a block that makes arrays of lists."""
@@ -40,12 +32,18 @@ def without_pandas() -> Iterator[None]:
     if shim is None or "pandas" in sys.modules:
         yield
         return
-    finder = _NoPandas()
-    sys.meta_path.insert(0, finder)  # type: ignore[arg-type]
+
+    class Finder:
+        @staticmethod
+        def find_spec(name: str, *_: Any) -> None:
+            if name == "pandas":
+                raise ImportError
+
+    sys.meta_path.insert(0, Finder)  # type: ignore[arg-type]
     try:
         pa.array([])  # looks for pandas once
     finally:
-        sys.meta_path.remove(finder)  # type: ignore[arg-type]
+        sys.meta_path.remove(Finder)  # type: ignore[arg-type]
     try:
         yield
     finally:

@@ -295,7 +295,6 @@ def shown(monkeypatch):
 
     for module in ("magtwin.io.rerun.file.show", "magtwin.io.rerun.viewer.show"):
         monkeypatch.setattr(module, show)
-    monkeypatch.setattr("shutil.which", lambda name: None)
     return seen
 
 
@@ -334,7 +333,6 @@ def test_view_shows_several_runs_in_one_recording(run, written, shown, tmp_path)
 def test_view_without_a_display_refuses_a_stage_and_names_the_picture(lab_scene, monkeypatch, capsys):
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr("shutil.which", lambda name: None)
     monkeypatch.setattr("sys.platform", "linux")
     assert "no display to show it on; magtwin picture draws it" in refused(capsys, "view", lab_scene)
 

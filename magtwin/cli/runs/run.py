@@ -269,15 +269,13 @@ def _run_robots(
     **options: Any,
 ) -> Done:
     """Drive the robots of a scene of several, and write the run of each, or of the one that is named."""
-    from magtwin.io.outputs import Driven
+    from magtwin.io.outputs import OPENING, Driven
     from magtwin.path import Path as Planned
     from magtwin.report.report import Report
     from magtwin.sim.motion.drive_input import drive_input
     from magtwin.twin import led_by, open_twin, room_of, scan, simulate_robots
 
-    names_of_opening = ("lab", "map_layer", "network", "magnetometer", "model_error", "tracking_error")
-    opening = {name: options.pop(name) for name in names_of_opening}
-    twin = open_twin(scene, **opening)
+    twin = open_twin(scene, **{name: options.pop(name) for name in OPENING})
     ways: dict[str, Any] = {spec.robot.name: spec.path or "figure8" for spec in twin.scene.robots}
     if robot is not None and what is not None:
         ways[robot] = what
