@@ -1,11 +1,11 @@
-"""`magtwin doctor`: what is installed, and what each missing extra would add."""
+"""`magtwin doctor`: what is installed, and what each missing extra would add; and `magtwin completion`."""
 
 import re
 import shutil
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Done
@@ -111,3 +111,20 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return ""
+
+
+@app.command
+def completion(shell: Literal["bash", "zsh", "fish"]) -> Done:
+    """Print a script that completes magtwin's commands and options in a shell.
+
+    bash: magtwin completion bash > ~/.local/share/bash-completion/completions/magtwin
+    zsh: magtwin completion zsh > a folder of $fpath, as _magtwin
+    fish: magtwin completion fish > ~/.config/fish/completions/magtwin.fish
+
+    Parameters
+    ----------
+    shell
+        Shell that will read the script.
+    """
+    script = app.generate_completion(shell=shell)
+    return Done(text=script.rstrip("\n"), data={"shell": shell, "script": script})
