@@ -1,6 +1,5 @@
 """`magtwin doctor`: what is installed, and what each missing extra would add; and `magtwin completion`."""
 
-import re
 import shutil
 import sys
 from importlib.util import find_spec
@@ -11,21 +10,24 @@ from magtwin.cli.app import app
 from magtwin.cli.terminal import Done
 
 ADDS = {
-    "cluster": "work on a dask cluster (magtwin bench --dask, magtwin sweep --dask)",
-    "decomposition": "convex decomposition of collision meshes (magtwin robot --collision decomposition)",
-    "gym": "a Gymnasium environment (magtwin.gym)",
-    "onnx": "networks as ONNX (magtwin network export, magtwin export)",
-    "pandas": "runs as pandas tables (Run.to_pandas)",
-    "physics": "driving in Newton (magtwin run --engine newton)",
-    "physx": "driving in NVIDIA's PhysX (magtwin validate --against physx)",
-    "polars": "runs as polars tables (Run.to_polars)",
-    "ros": "ROS 2 nodes on a machine without ROS (magtwin ros)",
-    "simready": "NVIDIA's SimReady profiles (magtwin validate --against simready)",
-    "validate": "NVIDIA's asset validator (magtwin validate --against nvidia)",
-    "view": "pictures and films of stages (magtwin picture, magtwin film)",
-    "xarray": "runs as xarray datasets (Run.to_xarray)",
+    "cluster": ("distributed", "work on a dask cluster (magtwin bench --dask, magtwin sweep --dask)"),
+    "decomposition": (
+        "coacd",
+        "convex decomposition of meshes (magtwin robot --collision decomposition)",
+    ),
+    "gym": ("gymnasium", "a Gymnasium environment (magtwin.gym)"),
+    "onnx": ("onnxruntime", "networks as ONNX (magtwin network export, magtwin export)"),
+    "pandas": ("pandas", "runs as pandas tables (Run.to_pandas)"),
+    "physics": ("newton", "driving in Newton (magtwin run --engine newton)"),
+    "physx": ("ovphysx", "driving in NVIDIA's PhysX (magtwin validate --against physx)"),
+    "polars": ("polars", "runs as polars tables (Run.to_polars)"),
+    "ros": ("cyclonedds", "ROS 2 nodes on a machine without ROS (magtwin ros)"),
+    "simready": ("simready-validate", "NVIDIA's SimReady profiles (magtwin validate --against simready)"),
+    "validate": ("usd-validation-nvidia", "NVIDIA's asset validator (magtwin validate --against nvidia)"),
+    "view": ("pyvista", "pictures and films of stages (magtwin picture, magtwin film)"),
+    "xarray": ("xarray", "runs as xarray datasets (Run.to_xarray)"),
 }
-"""What each extra is for."""
+"""The main package of each extra, and what it is for."""
 
 PACKAGES = ("usd-core", "rerun-sdk", "torch", "numpy", "scipy", "numba", "pyarrow", "rosbags", "cyclopts")
 """Packages whose version matters in a report of a fault."""
@@ -82,25 +84,15 @@ def diagnose() -> dict[str, Any]:
 
 
 def _extras() -> dict[str, dict[str, Any]]:
-    """Each extra: which of its packages are missing, what it adds and how to install it."""
-    from importlib.metadata import PackageNotFoundError, metadata
-
-    try:
-        required = metadata("magtwin").get_all("Requires-Dist") or []
-    except PackageNotFoundError:  # run from a source tree
-        required = []
-    extras: dict[str, dict[str, Any]] = {}
-    for name, adds in ADDS.items():
-        lines = [line for line in required if re.search(rf"extra == ['\"]{name}['\"]", line)]
-        packages = [match.group() for line in lines if (match := re.match(r"[\w.-]+", line))]
-        missing = [package for package in packages if not _version(package)]
-        extras[name] = {
-            "installed": bool(packages) and not missing,
-            "missing": missing,
+    """Each extra: whether it is installed, what it adds and how to install it."""
+    return {
+        name: {
+            "installed": bool(_version(package)),
             "adds": adds,
             "install": f"pip install 'magtwin[{name}]'",
         }
-    return extras
+        for name, (package, adds) in ADDS.items()
+    }
 
 
 def _version(package: str) -> str:
