@@ -23,12 +23,9 @@ An installed package can announce them as entry points instead, in the groups `m
 
 import importlib
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from magtwin.errors import InputError, find
-
-if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint
 
 T = TypeVar("T")
 C = TypeVar("C")
@@ -64,7 +61,7 @@ class Registry(Mapping[str, T]):
         self.kind, self.group = kind, f"magtwin.{group}"
         self._builtin = dict(builtin or {})
         self._loaded: dict[str, T] = {}
-        self._installed: dict[str, EntryPoint] | None = None
+        self._installed: dict[str, Any] | None = None
 
     def register(self, name: str) -> Callable[[C], C]:
         """Decorate a function or a class: it gets a name in this registry.
@@ -113,7 +110,7 @@ class Registry(Mapping[str, T]):
     def __contains__(self, name: object) -> bool:
         return name in self._builtin or name in self._loaded or name in self._entry_points()
 
-    def _entry_points(self) -> dict[str, "EntryPoint"]:
+    def _entry_points(self) -> dict[str, Any]:
         if self._installed is None:
             from importlib.metadata import entry_points
 

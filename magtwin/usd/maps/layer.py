@@ -108,11 +108,7 @@ def is_map_layer(path: str | os.PathLike[str]) -> bool:
 
 @translates
 def layer_of_map(path: str | os.PathLike[str]) -> Path | None:
-    """The file of the layer that holds the values of a stage's map; None if it has no map, or several.
-
-    Raises:
-        InputError: The file is missing or not USD.
-    """
+    """The file of a stage's layer with the values of its map; None if it has none or several maps."""
     stage = open_stage(path)
     maps = prims_with(stage.GetPseudoRoot(), "anomalyMap")
     values = maps[0].GetAttribute(attribute_name("anomalyMap", "values")) if len(maps) == 1 else None
