@@ -47,7 +47,7 @@ REFUSALS = [
     # what is in files
     ("run empty.toml", "empty"),
     ("run room.toml", "author it first: magtwin scene"),
-    ("scene key.toml --out new", "key.toml: no", "did you mean 'lab'"),
+    ("scene key.toml --out new", "key.toml:", "did you mean 'lab'"),
     ("scene labb --out new", "no scene 'labb'; did you mean 'lab'"),
     ("scene lab --map room/room.usda --out new", "is no map layer"),
     ("network convert evil.pth --out new.safetensors", "evil.pth", "open"),
