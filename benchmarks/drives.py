@@ -32,9 +32,10 @@ PIECE_S, PIECES, BLOCK_M, BLOCKS = 10.0, 0.15, 0.6, 0.1
 def drive(folder, minutes, seed):
     """A drive's Parquet file."""
     file = folder / f"drive_{seed}.parquet"
-    command = [sys.executable, "-m", "magtwin", "run", str(SCENE), "--path", "random", "--rate-hz", "17"]
+    command = [sys.executable, "-m", "magtwin", "run", str(SCENE), "--path", "random"]
     command += ["--duration-s", str(60 * minutes), "--seed", str(seed), "--magnetometer", "physical"]
-    subprocess.run([*command, "--out", str(file)], check=True, capture_output=True)
+    rate = {**os.environ, "MAGTWIN_RUN_RATE_HZ": "17"}
+    subprocess.run([*command, "--out", str(file)], env=rate, check=True, capture_output=True)
     return file
 
 

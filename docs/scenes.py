@@ -136,7 +136,7 @@ Here `lab/` is in the folder of `building.usda`. A stage names files of its own 
 * **Readings** of a moved and turned lab equal those of the lab at the origin, to the byte. Poses and fields
   are in the lab's axes. The run's metadata keep the lab's path (`lab`, on a stage of several labs) and its
   x, y, z [m] and yaw [rad] on the stage (`lab_pose`).
-* **Commands.** `run`, `sweep`, `drive`, `ros sim`, `ros magnetometer` and `map survey` take `--lab`, a
+* **Commands.** `run`, `drive`, `ros sim`, `ros magnetometer` and `map survey` take `--lab`, a
   benchmark's scenario has the key `lab`, and in Python it is `open_twin(stage, lab=...)`, also of the gym
   environments. Newton drives a lab wherever it stands. Of several labs, `magtwin export` takes the lab's own
   stage.

@@ -23,7 +23,6 @@ An installed package can announce them as entry points instead, in the groups `m
 
 import importlib
 from collections.abc import Callable, Iterator, Mapping
-from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
 from magtwin.errors import InputError, find
@@ -62,7 +61,7 @@ class Registry(Mapping[str, T]):
         self.kind, self.group = kind, f"magtwin.{group}"
         self._builtin = dict(builtin or {})
         self._loaded: dict[str, T] = {}
-        self._installed: dict[str, EntryPoint] | None = None
+        self._installed: dict[str, Any] | None = None
 
     def register(self, name: str) -> Callable[[C], C]:
         """Decorate a function or a class: it gets a name in this registry.
@@ -111,8 +110,10 @@ class Registry(Mapping[str, T]):
     def __contains__(self, name: object) -> bool:
         return name in self._builtin or name in self._loaded or name in self._entry_points()
 
-    def _entry_points(self) -> dict[str, EntryPoint]:
+    def _entry_points(self) -> dict[str, Any]:
         if self._installed is None:
+            from importlib.metadata import entry_points
+
             self._installed = {point.name: point for point in entry_points(group=self.group)}
         return self._installed
 

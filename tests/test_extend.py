@@ -1,11 +1,11 @@
 """Registry: built-in, registered and installed entries by name."""
 
+import importlib.metadata
 import sys
 from importlib.metadata import EntryPoint
 
 import pytest
 
-from magtwin import extend
 from magtwin.errors import InputError, UnknownNameError
 from magtwin.extend import Registry
 
@@ -15,7 +15,7 @@ def things(monkeypatch, **installed):
         assert group == "magtwin.things"
         return [EntryPoint(name, value, group) for name, value in installed.items()]
 
-    monkeypatch.setattr(extend, "entry_points", entry_points)
+    monkeypatch.setattr(importlib.metadata, "entry_points", entry_points)
     return Registry("thing", "things", {"decoder": "json:JSONDecoder"})
 
 

@@ -131,7 +131,9 @@ def test_a_run_that_names_both_is_reproduced_and_refused_once_its_map_changed(
 
 def test_sweep_and_drive_and_ros_sim_take_both(building, late, tmp_path, capsys, monkeypatch):
     where = ["--lab", "LabB", "--map", str(late)]
-    main(["sweep", str(building), *where, "--count=1", "--duration-s=1", "--out", str(tmp_path / "sweep")])
+    monkeypatch.setenv("MAGTWIN_SWEEP_LAB", "LabB")
+    out = ["--out", str(tmp_path / "sweep")]
+    main(["sweep", str(building), *where[2:], "--count=1", "--duration-s=1", *out])
     assert of_lab_b(read_run(tmp_path / "sweep" / "run_00000.parquet")) == late.as_posix()
     (tmp_path / "keys").write_bytes(b"wq")
     with (tmp_path / "keys").open() as keys:

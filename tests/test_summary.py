@@ -9,7 +9,6 @@ from pathlib import Path as FilePath
 import numpy as np
 import pytest
 
-import magtwin
 from magtwin.errors import InputError
 from magtwin.field.fit.fit import fit
 from magtwin.field.maps.difference import difference
@@ -27,7 +26,7 @@ from magtwin.learn.training.config import TrainConfig
 from magtwin.learn.training.train import fit as train
 from magtwin.path import path_named
 from magtwin.report.report import Figure, Report
-from magtwin.report.summary import LINES, WIDTH, Summarized, Summary
+from magtwin.report.summary import LINES, WIDTH, Summarized
 from magtwin.run.compare import compare
 from magtwin.run.run import Column, Run
 from magtwin.sim.motion.commands import Commands
@@ -151,16 +150,6 @@ def test_every_noun_shows_itself_in_five_lines_and_in_html(twin, run, learnt):
         assert Tags(noun._repr_html_()).tags <= allowed, name
 
 
-def test_a_run_tells_rows_duration_rate_scene_path_and_range(run):
-    b = run["b_measured_nt"]
-    text = repr(run)
-    assert "6,750 rows x 38 columns, 49.99 s at 135 Hz" in text
-    assert "scene lab, path figure8, seed 0" in text
-    assert f"{b.min():,.0f} to {b.max():,.0f} nT, mean {b.mean():,.0f} nT (b_measured_nt)" in text
-    flagged = run.with_columns(flag_bump=np.arange(run.rows) < 7)
-    assert "flag_bump in 7 rows" in repr(flagged)
-
-
 def test_a_map_tells_extent_spacing_headings_method_height_day_and_range(twin):
     text = repr(twin.field)
     for words in (
@@ -197,35 +186,6 @@ def test_hostile_names_stay_in_their_line_and_are_escaped_in_html(twin, run):
         assert "<script" not in html, name
 
 
-def test_columns_complete_as_keys_and_not_as_attributes(run):
-    assert run._ipython_key_completions_() == list(run)
-    assert "b_total_nt" not in dir(run)
-    own = run.with_columns(mine=run["t"])
-    assert own._ipython_key_completions_()[-1] == "mine"
-    assert dir(own) == dir(run)
-
-
-def test_the_whole_repr_of_a_long_run_takes_no_longer_than_a_look(run):
-    long = Run(
-        {"t": np.arange(2e6), "b_total_nt": np.full(2_000_000, 5e4), "p_world_base": np.zeros((2_000_000, 3))}
-    )
-    assert "2,000,000 rows" in repr(long)
-    assert len(long._repr_html_()) < 5_000
-
-
-def test_long_words_of_a_notebooks_table_break_in_a_narrow_window():
-    html = Summary("Map", (("source", f"a.csv sha256:{'0' * 64}"),)).html()
-    assert re.search(r'<td style="[^"]*overflow-wrap:anywhere[^"]*">a\.csv sha256:0{64}</td>', html)
-
-
-def test_to_pandas_tells_units_and_frames(run):
-    frame = run.to_pandas()
-    assert len(frame) == run.rows
-    assert (frame.attrs["units"]["imu_w_x"], frame.attrs["frames"]["imu_w_x"]) == ("rad/s", "imu_link")
-    assert frame.attrs["units"].keys() == frame.attrs["frames"].keys() == set(frame.columns)
-    assert frame.attrs["metadata"]["scene"] == "lab"
-
-
 def labels_of(figure):
     return [ax.get_xlabel() for ax in figure.axes], [ax.get_ylabel() for ax in figure.axes]
 
@@ -251,18 +211,6 @@ def test_a_run_is_drawn_by_the_columns_that_it_has(run):
         run.take(slice(0)).plot()
     with pytest.raises(InputError, match="neither positions nor columns of numbers"):
         Run({"t": np.arange(3.0)}).plot()
-
-
-def test_a_map_is_drawn_with_one_panel_per_heading(twin):
-    x, y = labels_of(figure := twin.field.plot("variance"))
-    assert (x.count("x [m]"), y.count("y [m]"), "standard deviation [nT]" in y) == (2, 2, True)
-    assert [ax.get_title() for ax in figure.axes[:4]] == [f"heading {h}°" for h in (0, 90, 180, 270)]
-    assert len(twin.field.plot(headings=[0.5]).axes) == 2
-
-
-def test_plot_refuses_what_it_cannot_draw():
-    with pytest.raises(InputError, match="plot draws a Run or an AnomalyMap, got int"):
-        magtwin.plot(3)
 
 
 CAME_LATER = {

@@ -40,7 +40,7 @@ NAME = "bench"
 def report_results(
     folders: Sequence[str | os.PathLike[str]], out: str | os.PathLike[str], *, force: bool = False
 ) -> None:
-    """Write the report of results as a folder: bench.html, bench.md and bench.json.
+    """Write the report of results as a folder: bench.html, bench.json and the pictures.
 
     Args:
         folders: Folders of results of one suite.

@@ -18,7 +18,7 @@ from cyclopts.exceptions import CycloptsError
 
 from magtwin.cli.options import Json, Quiet
 from magtwin.cli.progress import watched
-from magtwin.cli.settings import Environment, Settings
+from magtwin.cli.settings import Environment, Settings, is_setting
 from magtwin.cli.terminal import Done, output_mode, print_error
 from magtwin.errors import TERMINATED, CalibrationWarning, InputError, MismatchWarning, RepairWarning
 from magtwin.files.folders import allow
@@ -76,7 +76,7 @@ def main(arguments: list[str] | None = None) -> None:
             )
             sys.stdout.flush()  # a fault is reported here
     except CycloptsError as error:
-        _fail(_dashed(arguments) or _with_file(error), status=2)
+        _fail(_moved(arguments) or _with_file(error), status=2)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # `magtwin info ... | head`
@@ -93,8 +93,6 @@ def main(arguments: list[str] | None = None) -> None:
         if isinstance(error, MemoryError) or _TOO_LITTLE.search(str(error)):
             text = str(error).partition(" for an array")[0].partition(". Error code")[0]
             _fail(f"not enough memory{f' ({text})' if text else ''}; give less data or smaller options")
-        if isinstance(error, FileNotFoundError) and _folder_gone():
-            _fail("the working folder was removed; change to another one")
         if isinstance(error, OSError):
             from magtwin.files.outputs import FULL
 
@@ -141,21 +139,20 @@ def _allowed(arguments: list[str]) -> tuple[list[str], list[str]]:
     return others, folders
 
 
-def _dashed(arguments: list[str]) -> str:
-    """The refusal of a file whose name begins with a dash and was read as an option; "" if there is none."""
-    for word in arguments:
-        if word.startswith("-") and "=" not in word and "." in word and not word[1:2].isdigit():
-            return f"{word}: begins with a dash, so it is read as an option; for a file write ./{word}"
+MOVED = {
+    ("run", "--commands"): "--path FILE",
+    ("run", "--replay"): "--path FILE",
+    ("sweep", "--session"): "--sessions survey",
+}
+"""Options of earlier releases, by command, and what they are now."""
+
+
+def _moved(arguments: list[str]) -> str:
+    """The refusal of an option that has become another one; "" if there is none."""
+    for word in (word.partition("=")[0] for word in arguments[1:]):
+        if now := MOVED.get((arguments[0], word)):
+            return f"{word} is now {now}"
     return ""
-
-
-def _folder_gone() -> bool:
-    """Whether the working folder was removed."""
-    try:
-        Path.cwd()
-    except FileNotFoundError:
-        return True
-    return False
 
 
 def _stdout_full() -> str:
@@ -260,7 +257,8 @@ def _flags() -> dict[str, str]:
     for command in _running:
         for argument in command.assemble_argument_collection(parse_docstring=False):
             if argument.name.startswith("--"):
-                flags[argument.name.removeprefix("--").replace("-", "_")] = argument.name
+                name = argument.name.removeprefix("--").replace("-", "_")
+                flags[name] = f"[{command.name[0]}] {name}" if is_setting(argument) else argument.name
     return flags | {name: flags[key] for name, key in ALIASES.items() if key in flags}
 
 

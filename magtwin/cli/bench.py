@@ -94,8 +94,7 @@ def bench(
 def report(*folders: Results, out: Path | None = None, force: Force = False) -> Done:
     """Write a report on results: leaderboard, distributions of errors, and errors over time.
 
-    The report is a folder with bench.html, which is self-contained, bench.md with its pictures, and
-    bench.json.
+    The report is a folder with bench.html, which is self-contained, bench.json, and the pictures.
 
     Parameters
     ----------

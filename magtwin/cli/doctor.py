@@ -1,27 +1,26 @@
-"""`magtwin doctor`: what is installed, and what each missing extra would add."""
+"""`magtwin doctor`: what is installed, and what each missing extra would add; and `magtwin completion`."""
 
-import re
 import shutil
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Done
 
 ADDS = {
-    "cluster": "work on a dask cluster (magtwin bench --dask, magtwin sweep --dask)",
-    "gym": "a Gymnasium environment (magtwin.gym)",
-    "onnx": "networks as ONNX (magtwin network export, magtwin export)",
-    "pandas": "runs as pandas tables (Run.to_pandas)",
-    "physics": "driving in Newton (magtwin run --engine newton)",
-    "ros": "ROS 2 nodes on a machine without ROS (magtwin ros)",
-    "simready": "NVIDIA's SimReady profiles (magtwin validate --against simready)",
-    "validate": "NVIDIA's asset validator (magtwin validate --against nvidia)",
-    "view": "pictures and films of stages (magtwin picture, magtwin film)",
+    "cluster": ("distributed", "work on a dask cluster (magtwin bench --dask, magtwin sweep --dask)"),
+    "gym": ("gymnasium", "a Gymnasium environment (magtwin.gym)"),
+    "onnx": ("onnxruntime", "networks as ONNX (magtwin network export, magtwin export)"),
+    "pandas": ("pandas", "runs as pandas tables (Run.to_pandas)"),
+    "physics": ("newton", "driving in Newton (magtwin run --engine newton)"),
+    "ros": ("cyclonedds", "ROS 2 nodes on a machine without ROS (magtwin ros)"),
+    "simready": ("simready-validate", "NVIDIA's SimReady profiles (magtwin validate --against simready)"),
+    "validate": ("usd-validation-nvidia", "NVIDIA's asset validator (magtwin validate --against nvidia)"),
+    "view": ("pyvista", "pictures and films of stages (magtwin picture, magtwin film)"),
 }
-"""What each extra is for."""
+"""The main package of each extra, and what it is for."""
 
 PACKAGES = ("usd-core", "rerun-sdk", "torch", "numpy", "scipy", "numba", "pyarrow", "rosbags", "cyclopts")
 """Packages whose version matters in a report of a fault."""
@@ -59,7 +58,6 @@ def diagnose() -> dict[str, Any]:
     vulkan = ", ".join(drivers) if find_library("vulkan") else ""
     tools = (
         ("Rerun viewer", shutil.which("rerun"), "pip install rerun-sdk"),
-        ("usdview", shutil.which("usdview"), "a build of OpenUSD; magtwin view opens a window without it"),
         ("Vulkan", vulkan, "apt install mesa-vulkan-drivers libvulkan1; pictures of recordings need it"),
         ("Newton", _version("newton"), "pip install 'magtwin[physics]'"),
         ("ROS 2, rclpy", find_spec("rclpy") and "installed", "source a ROS 2 installation"),
@@ -79,25 +77,15 @@ def diagnose() -> dict[str, Any]:
 
 
 def _extras() -> dict[str, dict[str, Any]]:
-    """Each extra: which of its packages are missing, what it adds and how to install it."""
-    from importlib.metadata import PackageNotFoundError, metadata
-
-    try:
-        required = metadata("magtwin").get_all("Requires-Dist") or []
-    except PackageNotFoundError:  # run from a source tree
-        required = []
-    extras: dict[str, dict[str, Any]] = {}
-    for name, adds in ADDS.items():
-        lines = [line for line in required if re.search(rf"extra == ['\"]{name}['\"]", line)]
-        packages = [match.group() for line in lines if (match := re.match(r"[\w.-]+", line))]
-        missing = [package for package in packages if not _version(package)]
-        extras[name] = {
-            "installed": bool(packages) and not missing,
-            "missing": missing,
+    """Each extra: whether it is installed, what it adds and how to install it."""
+    return {
+        name: {
+            "installed": bool(_version(package)),
             "adds": adds,
             "install": f"pip install 'magtwin[{name}]'",
         }
-    return extras
+        for name, (package, adds) in ADDS.items()
+    }
 
 
 def _version(package: str) -> str:
@@ -108,3 +96,20 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return ""
+
+
+@app.command
+def completion(shell: Literal["bash", "zsh", "fish"]) -> Done:
+    """Print a script that completes magtwin's commands and options in a shell.
+
+    bash: magtwin completion bash > ~/.local/share/bash-completion/completions/magtwin
+    zsh: magtwin completion zsh > a folder of $fpath, as _magtwin
+    fish: magtwin completion fish > ~/.config/fish/completions/magtwin.fish
+
+    Parameters
+    ----------
+    shell
+        Shell that will read the script.
+    """
+    script = app.generate_completion(shell=shell)
+    return Done(text=script.rstrip("\n"), data={"shell": shell, "script": script})

@@ -49,9 +49,9 @@ LEAST_PACE = 0.001
 def check_pace(pace: float) -> None:
     """Refuse a pace at which nothing would happen."""
     if not pace > 0:
-        raise InputError(f"--pace must be above 0 simulated seconds per second, got {pace:g}")
+        raise InputError(f"pace must be above 0 simulated seconds per second, got {pace:g}")
     if pace < LEAST_PACE:
-        raise InputError(f"--pace must be at least {LEAST_PACE:g}, got {pace:g}")
+        raise InputError(f"pace must be at least {LEAST_PACE:g}, got {pace:g}")
 
 
 Whole = Annotated[int, Parameter(converter=_whole)]
@@ -88,6 +88,7 @@ Session = Annotated[
         "and the robot's own field. survey: the robot as it was when the map was surveyed. Default: 0.",
     ),
 ]
+Sessions = Annotated[int | Literal["survey"] | None, Parameter(converter=_session)]
 Plant = Annotated[
     str | None,
     Parameter(
@@ -135,20 +136,9 @@ ModelError = Annotated[
         "outside its training set. With --no-model-error a reading is the prediction plus sensor noise."
     ),
 ]
-TrackingError = Annotated[
-    bool,
-    Parameter(
-        help="The path follower gets poses with the latency and errors of a real localization, so the robot "
-        "deviates from the path by some centimetres. With --no-tracking-error it gets exact poses."
-    ),
-]
 Lidar = Annotated[
     Literal["schedule", "on", "off"],
     Parameter(help="Whether the LiDAR follows its schedule, or stays on or off."),
-]
-Outside = Annotated[
-    Literal["nan", "clamp", "raise"],
-    Parameter(help="Reading outside the map: nan, the nearest value inside (clamp), or an error (raise)."),
 ]
 RateHz = Annotated[
     float | None, Parameter(help="Magnetometer readings per second [Hz]. Default: the scene's.")
@@ -190,23 +180,6 @@ Gamepad = Annotated[
         help="Linux gamepad such as /dev/input/js0. The left stick drives, Start ends. Default: the keyboard."
     ),
 ]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sensing:
-    """How a simulated robot reads its sensors; options of `magtwin run` and `magtwin sweep`."""
-
-    network: Network = None
-    magnetometer: Magnetometer = None
-    model_error: ModelError = True
-    tracking_error: TrackingError = True
-    rate_hz: RateHz = None
-    lidar: Lidar = "schedule"
-    outside: Outside = "nan"
-
-
-SensingOptions = Annotated[Sensing, Parameter(name="*")]
-SENSING = Sensing()
 
 
 @dataclass(frozen=True, kw_only=True)

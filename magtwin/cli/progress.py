@@ -1,15 +1,15 @@
 """Progress of commands on stderr: a bar on a terminal, else a line now and then.
 
 A thread watches each command. After `FIRST_S` of silence, and then every `EVERY_S`, it prints the current
-step with counts, rate and time left. So progress appears even while a library reports none.
+step with counts, rate and time left. So progress appears even while a library reports none. rich draws the
+bars, and is imported for them only.
 """
 
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from threading import Event, Lock, Thread
 from typing import Any, TextIO
 
@@ -23,16 +23,6 @@ EVERY_S = 10.0
 
 TICK_S = 0.1
 """Time between two looks at the clock [s]."""
-
-WINDOW_S, FEWEST = 30.0, 8
-"""Rates are means over this time [s] and over this many reports: long runs can end several at once."""
-
-LATE_S = 5.0
-"""Time without a report after which the rate counts as unknown [s], at least ..."""
-
-LATE = 3.0
-"""... and so many times the usual time between reports."""
-
 
 Advance = Callable[..., None]
 """What commands call and hand down to libraries as `progress`: `advance(done, total, what)`."""
@@ -48,49 +38,20 @@ class Step:
     done: float = 0
     total: float | None = None
     what: str = ""
-    seen: deque[tuple[float, float]] = field(default_factory=deque)
+    first: tuple[float, float] | None = None
+    """Time and count of the first report of this loop: a resumed one does not begin at 0."""
 
     def advance(self, now: float, done: float, total: float | None, what: str = "") -> None:
-        """Take a report at a time `now` [s]."""
-        seen = self.seen
-        if done < self.done:
-            seen.clear()  # another loop has begun
+        """Take a report at a time `now` [s]; a smaller count than before begins another loop."""
+        if self.first is None or done < self.done:
+            self.first = now, done
         self.done, self.total, self.what = done, total, what
-        if not seen or now - seen[-1][0] > TICK_S or len(seen) == 1:
-            seen.append((now, done))
-        else:
-            seen[-1] = (now, done)
-        while len(seen) > FEWEST and now - seen[1][0] > WINDOW_S:
-            seen.popleft()
 
     def rate(self, now: float) -> float | None:
-        """How many are done a second; None while that is unknown, or no report came for long."""
-        if len(self.seen) < 2:
+        """How many were done a second since the first report; None while that is unknown."""
+        if self.first is None or self.done <= self.first[1] or now <= self.first[0]:
             return None
-        (first, before), (last, after) = self.seen[0], self.seen[-1]
-        if after <= before or last <= first:
-            return None
-        rate = (after - before) / (last - first)
-        return rate if now - last < max(LATE_S, LATE * (last - first) / (len(self.seen) - 1)) else None
-
-    def left_s(self, now: float) -> float | None:
-        """Time left at a time `now` [s], None while that is unknown."""
-        rate = self.rate(now)
-        if rate is None or not self.total or self.done >= self.total:
-            return None
-        left = (self.total - self.done) / rate - (now - self.seen[-1][0])
-        return left if left > 0 else None  # later than usual
-
-    def line(self, now: float) -> str:
-        """The step in a line, at a time `now` [s]."""
-        count = f"{self.done:,.0f}" if self.done or self.total else ""
-        count += f" of {self.total:,.0f}" if self.total else ""
-        left, gone = self.left_s(now), now - self.began
-        time_text = f"{in_words(gone)} so far" if gone >= 1 else ""
-        time_text = time_text if left is None else f"{in_words(left)} left"
-        counted = f"{count} {self.unit}".strip() if count else ""
-        text = ", ".join(part for part in (counted, self.speed(now), time_text, self.what) if part)
-        return f"{self.title}: {text}" if text else f"{self.title} ..."
+        return (self.done - self.first[1]) / (now - self.first[0])
 
     def speed(self, now: float) -> str:
         """The rate in words, empty while it is unknown."""
@@ -101,6 +62,17 @@ class Step:
         if self.unit == "s":
             return f"{number} x real time"
         return f"{number} {self.unit}/s" if self.unit else f"{number}/s"
+
+    def line(self, now: float) -> str:
+        """The step in a line, at a time `now` [s]."""
+        count = f"{self.done:,.0f}" if self.done or self.total else ""
+        count += f" of {self.total:,.0f} {self.unit}" if self.total else f" {self.unit}" if count else ""
+        rate, gone = self.rate(now), now - self.began
+        spent = f"{in_words(gone)} so far" if gone >= 1 else ""
+        if rate and self.total and self.done < self.total:
+            spent = f"{in_words((self.total - self.done) / rate)} left"
+        text = ", ".join(part for part in (count.strip(), self.speed(now), spent, self.what) if part)
+        return f"{self.title}: {text}" if text else f"{self.title} ..."
 
 
 def in_words(seconds: float) -> str:
@@ -114,40 +86,32 @@ def in_words(seconds: float) -> str:
 
 
 class Watch:
-    """What one command is doing, and when it last printed a line about it."""
+    """What one command is doing, and when it last printed a line about it.
+
+    Args:
+        stream: Where lines go. Default: stderr; bars are drawn if that is a terminal.
+        clock: Gives the time [s].
+    """
 
     def __init__(self, *, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic) -> None:
-        """Begin to watch. Lines go to `stream`, by default stderr; bars are drawn if that is a terminal."""
         self._stream, self._clock = stream, clock
         self._terminal = stream is None and sys.stderr.isatty()
-        self._printed = clock()
-        self._reported = -float("inf")
-        self._base = Step("Starting", "", self._printed)
-        self._steps: list[Step] = []
+        self._printed, self._reported = clock(), -float("inf")
+        self._steps = [Step("Starting", "", self._printed)]  # innermost last
         self._bar: Any = None
         self._silent = 0
-        self._announces, self._mute = True, False
         self._lock = Lock()
+        self.announces, self.mute = True, False
+        """Whether steps are announced, and whether nothing at all is printed."""
         self.end = Event()
-
-    @contextmanager
-    def reduced(self, *, steps: bool, all: bool) -> Iterator[None]:  # noqa: A002
-        """Announce no steps, or print nothing at all, until the end of the block."""
-        before = self._announces, self._mute
-        self._announces, self._mute = not steps, all
-        try:
-            yield
-        finally:
-            self._announces, self._mute = before
 
     def step(self, text: str, *, announced: bool = True) -> None:
         """Name what is done next, whose length is unknown; printed at once if `announced`."""
-        now = self._clock()
         with self._lock:
-            self._base = Step(text, "", now)
-            if announced and self._announces:
+            self._steps[0] = Step(text, "", self._clock())
+            if announced and self.announces and not self.mute:
                 self._print(f"  {text} ...")
-                self._printed = now
+                self._printed = self._clock()
 
     @contextmanager
     def silence(self) -> Iterator[None]:
@@ -165,7 +129,7 @@ class Watch:
         step = Step(title, unit, self._clock())
         self._steps.append(step)
         try:
-            with self._drawn(step) if self._terminal and not self._mute else nullcontext() as draw:
+            with self._drawn(step) if self._terminal and not self.mute else nullcontext() as draw:
 
                 def advance(done: float, total: float | None, what: str = "") -> None:
                     step.advance(self._clock(), done, total, what)
@@ -176,19 +140,17 @@ class Watch:
                 yield advance
         finally:
             self._steps.remove(step)
-            self._base = Step("Finishing", "", self._clock())
+            self._steps[0] = Step("Finishing", "", self._clock())
 
     def tick(self) -> None:
         """Print a line if one is due."""
         with self._lock:
             now = self._clock()
-            if self._silent or self._mute or self._bar is not None or self.end.is_set():
+            if self._silent or self.mute or self._bar is not None or self.end.is_set():
                 return
-            if now - self._printed < FIRST_S or now - self._reported < EVERY_S:
-                return
-            step = self._steps[-1] if self._steps else self._base
-            self._print(f"  {step.line(now)}")
-            self._printed = self._reported = now
+            if now - self._printed >= FIRST_S and now - self._reported >= EVERY_S:
+                self._print(f"  {self._steps[-1].line(now)}")
+                self._printed = self._reported = now
 
     def run(self) -> None:
         """Print the lines that are due until `end` is set."""
@@ -205,36 +167,27 @@ class Watch:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-        mine = self._bar is None
-        if mine:
-            columns = (
-                TextColumn("{task.description}"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TextColumn("{task.fields[rate]}"),
-                TimeRemainingColumn(),
-                TextColumn("{task.fields[what]}"),
+        outer, speed, what = self._bar, TextColumn("{task.fields[rate]}"), TextColumn("{task.fields[what]}")
+        if outer is None:
+            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+            console = Console(stderr=True, force_terminal=True)
+            self._bar = Progress(
+                *columns, speed, TimeRemainingColumn(), what, console=console, redirect_stdout=False
             )
-            console = Console(file=self._stream, stderr=self._stream is None, force_terminal=True)
-            self._bar = Progress(*columns, console=console, redirect_stdout=False)
-            self._bar.start()
         bar = self._bar
         task = bar.add_task(f"  {step.title}", total=None, rate="", what="")
+
+        def draw() -> None:
+            rate = step.speed(self._clock())
+            bar.update(task, completed=step.done, total=step.total or None, rate=rate, what=step.what)
+
         try:
-            yield lambda: bar.update(
-                task,
-                completed=step.done,
-                total=step.total or None,
-                rate=step.speed(self._clock()),
-                what=step.what,
-            )
+            with bar if outer is None else nullcontext():
+                yield draw
         finally:
-            if mine:
-                bar.stop()
-                self._bar = None
-                self._printed = self._clock()
-            else:
+            if outer is not None:
                 bar.remove_task(task)
+            self._bar, self._printed = outer, self._clock()
 
 
 _watches: list[Watch] = []

@@ -1,16 +1,66 @@
-"""Options that are set in the environment and in magtwin.toml of the working folder."""
+"""Settings: options that are set in magtwin.toml of the working folder and in the environment.
+
+Every option of a command can be set there. Those of a class below are rare, and can only be set there:
+no flag and no help has them. docs/runs.md lists them.
+"""
 
 import difflib
 import os
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from cyclopts import App, ArgumentCollection
+from cyclopts import App, Argument, ArgumentCollection, Parameter
 from cyclopts.config import Env, Toml
 from cyclopts.exceptions import CycloptsError
 
+from magtwin.cli.options import Names
 from magtwin.errors import InputError, RepairWarning
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorSettings:
+    """How a simulated robot reads its sensors."""
+
+    model_error: bool = True
+    tracking_error: bool = True
+    lidar: Literal["schedule", "on", "off"] = "schedule"
+    outside: Literal["nan", "clamp", "raise"] = "nan"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSettings(SensorSettings):
+    """Settings of `magtwin run`."""
+
+    rate_hz: float | None = None
+    controller: Literal["follower", "release", "stanley", "pure_pursuit"] = "follower"
+    meet: Literal["refuse", "flag"] | None = None
+    out_unit: Literal["T", "nT"] | None = None
+    usd_fps: float | None = None
+    viewer: str | None = None
+    pace: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepSettings(SensorSettings):
+    """Settings of `magtwin sweep`."""
+
+    speed: float | None = None
+    lab: str = ""
+    network: Path | None = None
+    keep: Names = None
+
+
+_HIDDEN = Parameter(name="*", show=False)
+RunOptions = Annotated[RunSettings, _HIDDEN]
+SweepOptions = Annotated[SweepSettings, _HIDDEN]
+RUN, SWEEP = RunSettings(), SweepSettings()
+
+
+def is_setting(argument: Argument) -> bool:
+    """Whether an argument has no flag."""
+    return argument.parameter.show is False
 
 
 class Settings(Toml):
@@ -29,7 +79,16 @@ class Environment(Env):
     """Options in the environment; warns of a variable that names no option of the command."""
 
     def __call__(self, app: App, commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
-        """Add the options in the environment to those of the command line."""
+        """Refuse flags of settings, and add the options in the environment to those of the command line."""
+        for argument in arguments:
+            if is_setting(argument) and argument.tokens:
+                key = argument.name.removeprefix("--").replace("-", "_")
+                typed, table = argument.tokens[0].keyword, " ".join(commands)
+                variable = _in_capitals("_".join((*commands, key)))
+                raise CycloptsError(
+                    msg=f"{typed} is a setting: put `{key} = ...` below [{table}] in magtwin.toml, "
+                    f"or set {self.prefix}{variable}"
+                )
         super().__call__(app, commands, arguments)
         if not commands:
             return

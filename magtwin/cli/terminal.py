@@ -75,9 +75,10 @@ def output_mode(*, as_json: bool, quiet: bool) -> Iterator[None]:
     """Print JSON, or nothing, until the end of the block."""
     before = _mode.json, _mode.quiet
     _mode.json, _mode.quiet = as_json, quiet
+    watch = current()
+    watch.announces, watch.mute = not as_json, quiet
     try:
-        with current().reduced(steps=as_json or quiet, all=quiet):
-            yield
+        yield
     finally:
         _mode.json, _mode.quiet = before
 
@@ -180,12 +181,9 @@ def check_output(path: Path | None, suffixes: tuple[str, ...], what: str, *, for
 
 
 def print_report(report: Any) -> None:
-    """Print a report as tables."""
-    if not (_mode.json or _mode.quiet or sys.stdout.isatty() or os.environ.get("COLUMNS")):
-        lines = _lines(report)
-        if all(line.replace("±", "").isascii() and line.isprintable() for line in lines):
-            print(*lines, sep="\n")  # noqa: T201
-            return  # the same text, without importing rich, which takes a tenth of a small conversion
+    """Print a report as tables; nothing with --json or --quiet."""
+    if _mode.json or _mode.quiet:
+        return
     from rich.table import Table
     from rich.text import Text
 
@@ -236,25 +234,6 @@ def _content(report: Any) -> tuple[Rows, Rows, list[tuple[str, Rows]]]:
         elif entry != "":
             words.append((name, printable(str(entry))))
     return numbers, words, lists
-
-
-def _lines(report: Any) -> list[str]:
-    """The lines of a report for a file or another program, of any length."""
-    numbers, words, lists = _content(report)
-    lines = [printable(report.title)]
-    for rows in (numbers, words):
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        for row in rows:
-            cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
-            if rows is numbers:
-                cells[1] = row[1].rjust(widths[1])
-            lines.append("  ".join(cells))
-    if report.verdict:
-        lines.append(printable(report.verdict))
-    for name, entries in lists:
-        lines.append(name)
-        lines += [f"  {key}  {item}" if key else f"  {item}" for key, item in entries if key or item]
-    return [line.rstrip(" ") for line in lines]
 
 
 def _rounded(spread: float) -> str:

@@ -65,7 +65,7 @@ class Picture:
     """Width divided by height."""
 
     file: str = ""
-    """Name of its file without the suffix; in a written Markdown report its path. "" for no file."""
+    """Name of its file beside a page, without the suffix. Default: picture_0 and so on."""
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:

@@ -58,7 +58,7 @@ def film_of_run(
         out: MP4 (H.264) or GIF to write.
         fps: Frames per second.
         speed: Playback speed relative to the run. Default: 1, or more for a film of at most 30 s.
-        camera: "orbit", "top", "chase" or "x,y,z:x,y,z", as for `magtwin.figures.scenery.View.of`.
+        camera: "orbit", "top" or "x,y,z:x,y,z", as for `magtwin.figures.scenery.View.of`.
         size: Width and height [pixel]. Default: 1280 x 720, or 640 x 360 for a GIF.
         force: Whether to replace an existing file.
         advance: Called after each frame with the number of frames drawn, and their total.

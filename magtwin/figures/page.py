@@ -1,4 +1,4 @@
-"""Page: titled sections of pictures and tables, written as HTML, Markdown or JSON.
+"""Page: titled sections of pictures and tables, written as HTML or JSON.
 
 An HTML page is one file with its pictures inside. It loads nothing and runs no script, and text from files,
 such as metadata and names, is escaped.
@@ -10,7 +10,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,14 +20,14 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from magtwin.errors import InputError
 from magtwin.figures.canvas import Picture
 from magtwin.files.outputs import output
-from magtwin.report.summary import in_markdown, printable, printable_lines
+from magtwin.report.summary import printable, printable_lines
 from magtwin.version import __version__
 
 LONGEST_TEXT = 500
 """Characters of a cell that a page shows. JSON holds all of them."""
 
 PICTURES = "figures"
-"""Folder of the pictures of a Markdown page."""
+"""Folder of the pictures beside a page."""
 
 LONG_CELL = 24
 """Characters above which a table gives a cell's column more width."""
@@ -96,7 +96,7 @@ class Page:
 
 
 def write_page(page: Page, path: str | os.PathLike[str], *, force: bool = False) -> None:
-    """Write a page as .html, .md or .json, whichever its file name ends in.
+    """Write a page as .html or .json, whichever its file name ends in.
 
     Args:
         page: The page.
@@ -115,7 +115,7 @@ def write_page(page: Page, path: str | os.PathLike[str], *, force: bool = False)
 
 
 def write_pages(page: Page, folder: str | os.PathLike[str], name: str, *, force: bool = False) -> None:
-    """Write a page as a folder: NAME.html, .md and .json, and the pictures of the Markdown page.
+    """Write a page as a folder: NAME.html and .json, and its pictures in figures/.
 
     Args:
         page: The page.
@@ -128,15 +128,10 @@ def write_pages(page: Page, folder: str | os.PathLike[str], name: str, *, force:
     """
     with output(folder, force=force) as aside:
         (aside / PICTURES).mkdir(parents=True)
-        sections = []
         for section in page.sections:
-            pictures = []
             for k, picture in enumerate(section.pictures):
-                file = f"{PICTURES}/{picture.file or f'picture_{k}'}.{picture.kind}"
-                (aside / file).write_bytes(picture.data)
-                pictures.append(replace(picture, file=file))
-            sections.append(replace(section, pictures=tuple(pictures)))
-        page = replace(page, sections=tuple(sections))
+                file = aside / PICTURES / f"{picture.file or f'picture_{k}'}.{picture.kind}"
+                file.write_bytes(picture.data)
         for suffix, writer in WRITERS.items():
             (aside / f"{name}{suffix}").write_text(writer(page), encoding="utf-8")
 
@@ -147,32 +142,12 @@ def to_html(page: Page) -> str:
     return _TEMPLATES.get_template("page.html").render(page=page, links=links, version=__version__)
 
 
-def to_markdown(page: Page) -> str:
-    """A page as Markdown, with those of its pictures that have a file."""
-    several = len(page.sections) > 1
-    parts = [f"# {_marked(page.title)}", _marked(page.lead)]
-    if page.overview:
-        parts += _markdown_table(page.overview, 2)
-    for section in page.sections:
-        if several:
-            parts.append(f"## {_marked(section.title)}")
-        if section.lead:
-            parts.append(_marked(section.lead))
-        for picture in section.pictures:
-            if picture.file:
-                parts.append(f"![{_marked(picture.alt)}]({picture.file})\n\n{_marked(picture.title)}")
-        for table in section.tables:
-            parts += _markdown_table(table, 3 if several else 2)
-    parts.append(f"Written by magtwin {_marked(__version__)}.")
-    return "\n\n".join(parts) + "\n"
-
-
 def to_json(page: Page) -> str:
     """The data of a page as JSON; numbers that are not finite become null."""
     return json.dumps(_finite({"magtwin": __version__, "title": page.title, **page.data}), indent=2) + "\n"
 
 
-WRITERS: Mapping[str, Callable[[Page], str]] = {".html": to_html, ".md": to_markdown, ".json": to_json}
+WRITERS: Mapping[str, Callable[[Page], str]] = {".html": to_html, ".json": to_json}
 """Formats of a page by file name ending."""
 
 
@@ -196,23 +171,6 @@ def _is_number(value: Any) -> bool:
     if isinstance(value, str):
         return re.fullmatch(r"[+-]?\d{1,3}(,?\d{3})*(\.\d+)?( ?%| \(.*\))?", value) is not None
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _markdown_table(table: Table, level: int) -> list[str]:
-    parts = [f"{'#' * level} {_marked(table.title)}"]
-    if table.rows:
-        rows = [[cell.text for cell in row] for row in table.cells()]
-        lines = [[_marked(text) for text in row] for row in (table.head, *rows)]
-        lines.insert(1, ["---"] * len(table.head))
-        parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
-    if table.note:
-        parts.append(_marked(table.note))
-    return parts
-
-
-def _marked(text: str) -> str:
-    """Text with the characters escaped that have a meaning in Markdown."""
-    return in_markdown(text_of(text))
 
 
 def _finite(value: Any) -> Any:

@@ -93,14 +93,6 @@ class Camera:
     view_angle_deg: float = 30.0
     """Angle between the upper and the lower edge [deg]."""
 
-    def __post_init__(self) -> None:
-        if not (-90 <= self.elevation_deg <= 90):
-            raise InputError(f"elevation_deg of Camera must lie in -90..90, got {self.elevation_deg!r}")
-        if not (1 <= self.view_angle_deg <= 120):
-            raise InputError(f"view_angle_deg of Camera must lie in 1..120, got {self.view_angle_deg!r}")
-        if self.distance_m is not None and not self.distance_m > 0:
-            raise InputError(f"distance_m of Camera must be above 0, got {self.distance_m!r}")
-
     def axes(self) -> Array:
         """Right, up and back axes in world, as rows, shape (3, 3)."""
         a, e = np.radians([self.azimuth_deg, self.elevation_deg])
@@ -115,12 +107,12 @@ def picture_of_stage(
     *,
     size: tuple[int, int] = (1600, 1000),
     camera: Camera | None = None,
-    title: str | None = None,
     legend: bool = True,
-    ground: bool | None = None,
     force: bool = False,
 ) -> Path:
     """Draw a stage and write a PNG. Objects in front of a heat-map or a robot are drawn as a veil.
+
+    A stage of moving bodies only, a robot alone, gets a floor if the camera looks down on it.
 
     Args:
         path: USD file.
@@ -128,10 +120,7 @@ def picture_of_stage(
         size: Width and height [pixel].
         camera: The camera. Default: from the front left and above, with everything in view; of a lab, its
             heat-map.
-        title: A line at the top.
         legend: Whether a stage with an anomaly map gets the colour bar of its heat-map.
-        ground: Whether to draw a floor below everything. Default: if the stage has only moving bodies (a
-            robot alone) and the camera looks down on them.
         force: Whether to replace an existing file.
 
     Returns:
@@ -146,9 +135,7 @@ def picture_of_stage(
     with output(out, force=force) as aside:
         plotter = plotter_of(size)
         try:
-            screens = _draw(plotter, path, size, camera, legend=legend, ground=ground)
-            if title:
-                add_text(plotter, title, round(size[1] / 80))
+            screens = _draw(plotter, path, size, camera, legend=legend)
             write_png(Cutaway(plotter, size, screens).image(), aside)
         finally:
             plotter.close()
@@ -198,7 +185,6 @@ def _draw(
     camera: Camera | None,
     *,
     legend: bool = True,
-    ground: bool | None = None,
 ) -> list[Any]:
     """Draw a stage, with lights and camera; returns the actors that may hide the subject."""
     stage = open_stage(path)
@@ -231,9 +217,9 @@ def _draw(
     for (chosen, flat, opacity), meshes in bodies.items():
         actors.append((plotter.add_mesh(joined(meshes), opacity=opacity, **style_of(flat)), chosen))
     screens = [actor for actor, chosen in actors if not chosen] if any(subject) else []
-    if ground is None:
-        ground = camera.elevation_deg > 0 and all(s.link for s in shapes)
-    if ground:  # just below everything, in the colour of the background: only shadows on it are visible
+    if camera.elevation_deg > 0 and all(
+        s.link for s in shapes
+    ):  # just below everything, in the colour of the background: only shadows on it are visible
         import pyvista
 
         low, high = everything.min(axis=0), everything.max(axis=0)

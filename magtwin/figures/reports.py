@@ -1,6 +1,5 @@
-"""Reports: one run, several runs, or two runs compared, as a page; and one path driven twice."""
+"""Reports: one run or several as a page; two runs compared; and one path driven twice."""
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -71,7 +70,7 @@ def page_of_runs(
 
     Args:
         runs: The runs.
-        pictures: Whether to draw pictures, which only HTML shows.
+        pictures: Whether to draw pictures.
         advance: Called with the number of runs that are drawn.
 
     Raises:
@@ -82,53 +81,17 @@ def page_of_runs(
     for named in runs:
         if not named.run.rows or "t" not in named.run:
             raise InputError(f"{named.name}: has no readings to report on")
-    sections, data = [], []
+    sections = []
     for k, named in enumerate(runs):
         sections.append(_section(named, pictures))
-        data.append(_data(named))
         advance(k + 1)
     if len(runs) == 1:
-        return Page(_title(runs[0]), _sentence(runs[0].run), (sections[0],), data=data[0])
+        return Page(_title(runs[0]), _sentence(runs[0].run), (sections[0],))
     head = ("run", "path", "seed", "readings", "duration [s]", "distance [m]", "MAE [nT]", "RMS [nT]")
     note = "MAE and RMS: error of b_measured_nt against the exact field, where that is known."
     overview = Table("Overview", (*head, "events"), tuple(map(_overview, runs)), note)
     lead = f"{sum(named.run.rows for named in runs):,} readings in all."
-    return Page(f"{len(runs)} runs", lead, tuple(sections), overview, {"runs": data})
-
-
-def page_of_comparison(a: NamedRun, b: NamedRun, comparison: Comparison) -> Page:
-    """A page about two runs laid over each other.
-
-    Args:
-        a: The first run.
-        b: The second run.
-        comparison: Result of `magtwin.run.compare.compare` for the two.
-    """
-    how = {
-        "time": f"{b.name} is shifted by {comparison.shift:+.4f} s, which brings the positions closest.",
-        "path": f"Aligned by distance driven; {b.name} is shifted by {comparison.shift:+.4f} m.",
-        "none": "Aligned by the clocks of the runs, unchanged.",
-    }[comparison.align]
-    rows = tuple(
-        (row.name, row.unit, *_measures(row), row.count, _correlation(row)) for row in comparison.agreements()
-    )
-    head = ("quantity", "unit", *MEASURES, "readings", "correlation")
-    note = "Along-track: ahead of the first run; cross-track: to its left."
-    tables = [Table(f"{b.name} minus {a.name}", head, rows, note)]
-    one, other = a.run.metadata, b.run.metadata
-    names = [*sorted(one), *sorted(other.keys() - one.keys())]
-    differ = tuple(
-        (name, one.get(name, ""), other.get(name, "")) for name in names if one.get(name) != other.get(name)
-    )
-    if differ:
-        tables.append(Table("Metadata that differ", ("metadata", a.name, b.name), differ, exact=True))
-    pictures = tuple(_comparison_pictures(a, b, comparison))
-    return Page(
-        " and ".join(short_pair((a.name, b.name))),
-        f"{a.name} and {b.name}: {len(comparison.at):,} readings compared. {how}",
-        (Section("Comparison", "", pictures, tuple(tables)),),
-        data={"a": a.name, "b": b.name, **comparison.summary(), "metadata": [dict(one), dict(other)]},
-    )
+    return Page(f"{len(runs)} runs", lead, tuple(sections), overview)
 
 
 def _title(named: NamedRun) -> str:
@@ -196,26 +159,6 @@ def _overview(named: NamedRun) -> tuple[Any, ...]:
     )
 
 
-def _data(named: NamedRun) -> dict[str, Any]:
-    run = named.run
-    errors = {
-        name: {key: value for key, value in vars(row).items() if key not in ("name", "correlation")}
-        for name, row in errors_of(run).items()
-    }
-    events = [
-        {"flag": name, "readings": count, "spans_s": [list(span) for span in spans]}
-        for name, count, spans in _events(run)
-    ]
-    figures = json.loads(run.report(named.name).to_json())["figures"]
-    return {
-        "name": named.name,
-        "figures": figures,
-        "errors": errors,
-        "events": events,
-        "metadata": dict(run.metadata),
-    }
-
-
 def _distance_m(run: Run) -> float | None:
     figure = next((f for f in run.report().figures if f.name == "distance driven"), None)
     return None if figure is None else float(figure.value)
@@ -259,23 +202,13 @@ def _correlation(agreement: Agreement) -> str:
 def draw_comparison(a: NamedRun, b: NamedRun, comparison: Comparison) -> Figure:
     """Draw two runs by their own clocks, and aligned, as `magtwin.run.compare.compare` compared them."""
     panels = _panels(a, b, comparison)
-    heights = [panel.height for panel in panels]
+    heights = [height for _, height, _ in panels]
     figure = new_figure(9.0, 2.3 * sum(heights))
     axes = figure.subplots(len(panels), 1, squeeze=False, height_ratios=heights)[:, 0]
-    for ax, panel in zip(axes, panels, strict=True):
-        panel.draw(ax)
-        ax.set_title(panel.title, fontsize=10, loc="right")
+    for ax, (title, _, draw) in zip(axes, panels, strict=True):
+        draw(ax)
+        ax.set_title(title, fontsize=10, loc="right")
     return figure
-
-
-def _comparison_pictures(a: NamedRun, b: NamedRun, comparison: Comparison) -> list[Picture]:
-    """The panels of `draw_comparison` as pictures for a page."""
-    pictures = []
-    for panel in _panels(a, b, comparison):
-        figure = new_figure(WIDTH_IN, 2.5 * panel.height)
-        panel.draw(figure.subplots())
-        pictures.append(picture(figure, panel.title))
-    return pictures
 
 
 def section_of_traversals(both: Traversals, names: tuple[str, str]) -> Section:
@@ -299,15 +232,10 @@ def section_of_traversals(both: Traversals, names: tuple[str, str]) -> Section:
     return Section(title, "; ".join(runs) + ".", pictures, (Table(title, head, rows, note),))
 
 
-@dataclass(frozen=True)
-class _Panel:
-    title: str
-    height: float
-    draw: Callable[[Axes], None]
-
-
-def _panels(a: NamedRun, b: NamedRun, comparison: Comparison) -> list[_Panel]:
-    """Field as recorded, field aligned, distance between the two, and both paths."""
+def _panels(
+    a: NamedRun, b: NamedRun, comparison: Comparison
+) -> list[tuple[str, float, Callable[[Axes], None]]]:
+    """Title, height and drawing of the field as recorded and aligned, the distance, and both paths."""
     column, position = field_name(a.run, b.run), position_name(a.run, b.run)
     names = short_pair((a.name, b.name))
     along = "distance driven [m]" if comparison.align == "path" else "time [s]"
@@ -333,7 +261,7 @@ def _panels(a: NamedRun, b: NamedRun, comparison: Comparison) -> list[_Panel]:
         label(ax, "x [m]", "y [m]")
         legend_above(ax)
 
-    panels = []
+    panels: list[tuple[str, float, Callable[[Axes], None]]] = []
     if column is not None:
         match = next((row for row in comparison.agreements() if row.name == column), None)
         title = f"{names[1]} moved by {comparison.shift:+.3f} {comparison.unit}"
@@ -342,11 +270,11 @@ def _panels(a: NamedRun, b: NamedRun, comparison: Comparison) -> list[_Panel]:
         if match is not None:
             title += f": RMS {match.rms:,.0f} nT"
             title += "" if match.correlation is None else f", correlation {match.correlation:.3f}"
-        panels += [_Panel(f"{column} as recorded", 1.0, recorded), _Panel(title, 1.0, aligned)]
+        panels += [(f"{column} as recorded", 1.0, recorded), (title, 1.0, aligned)]
     if position is not None:
         title = f"Distance of {names[1]} from {names[0]}"
-        panels.append(_Panel(title, 1.0, lambda ax: _draw_distance(ax, comparison, along)))
-        panels.append(_Panel("Paths", 1.5, paths))
+        panels.append((title, 1.0, lambda ax: _draw_distance(ax, comparison, along)))
+        panels.append(("Paths", 1.5, paths))
     return panels
 
 

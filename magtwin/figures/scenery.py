@@ -46,18 +46,6 @@ Array = NDArray[np.float64]
 ORBIT_DEG_S = 5.0
 """Angular speed of the orbit camera in the film [deg/s]."""
 
-CHASE_BACK_M, CHASE_UP_M, CHASE_AHEAD_M = 1.3, 0.75, 0.3
-"""Position of the chase camera behind and above the robot, and of its target ahead of the robot [m]."""
-
-CHASE_ANGLE_DEG = 50.0
-
-CHASE_S = 0.7
-"""Time before and after a frame over which the chase camera averages the heading [s]."""
-
-WALL_M, WALL_LENGTH_M = 0.1, 1.0
-"""Clearance of the chase camera to the ends of the lab and to objects as high as itself, and least length of
-these objects [m]. Narrower objects become a veil."""
-
 TRAIL_STEP_M = 0.01
 """Step of the trail [m]."""
 
@@ -80,7 +68,7 @@ class View:
     """A camera for a run."""
 
     kind: str
-    """"top", "orbit", "chase", or "fixed"."""
+    """"top", "orbit", or "fixed"."""
 
     place: Vec3 = (0.0, 0.0, 0.0)
     """Position of a fixed camera [m]."""
@@ -90,7 +78,7 @@ class View:
 
     @classmethod
     def of(cls, text: str) -> "View":
-        """The view that a text names: top, orbit, chase, or `x,y,z:x,y,z`, place and target in world [m].
+        """The view that a text names: top, orbit, or `x,y,z:x,y,z`, place and target in world [m].
 
         Raises:
             InputError: The text names no view.
@@ -114,7 +102,7 @@ class View:
         return cls("fixed", (x, y, z), (tx, ty, tz))
 
     def camera(self, seen_s: float = 0.0) -> Camera:
-        """The camera over a lab, `seen_s` [s] into the film. The chase view starts like orbit."""
+        """The camera over a lab, `seen_s` [s] into the film."""
         if self.kind == "top":
             return Camera(azimuth_deg=-90.0, elevation_deg=90.0)
         if self.kind == "fixed":
@@ -130,8 +118,8 @@ class View:
         return Camera(azimuth_deg=40.0 + ORBIT_DEG_S * seen_s, elevation_deg=LAB_ELEVATION_DEG)
 
 
-KINDS = ("orbit", "top", "chase")
-"""From above at a slant, slowly round the lab; straight from above, x to the right; behind the robot."""
+KINDS = ("orbit", "top")
+"""From above at a slant, slowly round the lab; straight from above, x to the right."""
 
 
 class Scenery:
@@ -207,15 +195,7 @@ class Scenery:
         self.plotter.close()
 
     def frame(self, k: int, *, whole: bool = False) -> NDArray[np.uint8]:
-        """Draw frame k.
-
-        Args:
-            k: Index of the frame.
-            whole: Whether objects may hide the floor and the robot.
-
-        Returns:
-            Image, shape (height, width, 3).
-        """
+        """Draw frame k, shape (height, width, 3); objects hide the floor and the robot if `whole`."""
         for name, T_world_link in self.poses(k).items():
             self._actors[name].user_matrix = T_world_link
         quads = max(0, int(np.searchsorted(self._trail_t, self._times[k], side="right")) - 1)
@@ -303,8 +283,6 @@ class Scenery:
             self._actors[name] = self.plotter.add_mesh(joined(meshes), **style_of(False))
             self._links[name] = link
         self._everything = np.vstack([*placed, self._p]).astype(float)
-        boxes = np.array([(v.min(axis=0), v.max(axis=0)) for v in placed]).reshape(-1, 2, 3)
-        self._walls = boxes[np.ptp(boxes[..., :2], axis=1).max(axis=1) >= WALL_LENGTH_M]
 
     def _build_trail(self, run: Run, limits: tuple[float, float] | None) -> None:
         """Build the whole trail, coloured by the field; a frame shows the part driven so far."""
@@ -343,25 +321,10 @@ class Scenery:
             self._ribbons.append((mesh, actor, faces))
 
     def _aim(self, k: int) -> None:
-        if self._view.kind != "chase":
-            seen_s = (self._times[k] - self._times[0]) / self._speed
-            camera, around = self._view.camera(seen_s), self._around
-            if self._view.kind == "top":  # with the whole map, like a picture of the stage
-                around = np.vstack([around, *self._subjects])
-            aim(self.plotter, camera, around, self._size, bar=self._bar)
-            return
-        near = np.abs(self._times - self._times[k]) <= CHASE_S * self._speed
-        ahead = matrix_from_quat(self._q[near])[:, :2, 0].mean(axis=0)
-        ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
-        low, high = self._everything[:, :2].min(axis=0) + WALL_M, self._everything[:, :2].max(axis=0) - WALL_M
-        p, camera = self._p[k], self.plotter.camera
-        eye, back = np.array([p[0], p[1], p[2] + CHASE_UP_M]), np.array([*(-CHASE_BACK_M * ahead), 0.0])
-        back *= _free_share(eye, back, self._walls)
-        camera.position = (*np.clip((eye + back)[:2], low, high), eye[2])
-        camera.focal_point = (*(p[:2] + CHASE_AHEAD_M * ahead), p[2] + 0.2)
-        camera.up = (0.0, 0.0, 1.0)
-        camera.view_angle = CHASE_ANGLE_DEG
-        self.plotter.renderer.ResetCameraClippingRange()
+        camera, around = self._view.camera((self._times[k] - self._times[0]) / self._speed), self._around
+        if self._view.kind == "top":  # with the whole map, like a picture of the stage
+            around = np.vstack([around, *self._subjects])
+        aim(self.plotter, camera, around, self._size, bar=self._bar)
 
 
 def picture_of_run(
@@ -381,7 +344,7 @@ def picture_of_run(
         scene_file: Stage of its lab.
         out: PNG to write.
         time_s: Time on the run's clock [s]. Default: the end of the run.
-        camera: "top", "orbit", "chase" or "x,y,z:x,y,z", as for `View.of`.
+        camera: "top", "orbit" or "x,y,z:x,y,z", as for `View.of`.
         size: Width and height [pixel].
         force: Whether to replace an existing file.
 
@@ -427,22 +390,6 @@ def _links_of(links: Mapping[str, Link], robots: Sequence[str], run: Run) -> dic
         raise InputError(f"the metadata of the run name no robot of the scene, which has {', '.join(robots)}")
     base = bases[robots.index(name)] if len(robots) == len(bases) and name in robots else bases[0]
     return {name: link for name, link in links.items() if link.base == base}
-
-
-def _free_share(p: Array, d: Array, boxes: Array) -> float:
-    """Share of a segment that is farther than `WALL_M` from all boxes, from its start on.
-
-    Args:
-        p: Start in world [m], shape (3,).
-        d: Vector from the start to the end [m], shape (3,).
-        boxes: Least and greatest corners of axis-aligned boxes [m], shape (N, 2, 3).
-    """
-    low, high = boxes[:, 0] - WALL_M, boxes[:, 1] + WALL_M
-    d = np.where(np.abs(d) < 1e-12, 1e-12, d)
-    ends = np.sort(np.stack([(low - p) / d, (high - p) / d]), axis=0)  # slab by slab
-    enters, leaves = ends[0].max(axis=1), ends[1].min(axis=1)
-    met = (enters <= leaves) & (enters > 0) & (enters < 1)
-    return float(enters[met].min()) if met.any() else 1.0
 
 
 def _steps(p_xy: Array) -> NDArray[np.intp]:

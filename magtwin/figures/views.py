@@ -1,6 +1,5 @@
 """Views of files: show, draw or film a run or a stage; a page about runs; two runs compared."""
 
-import shutil
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
@@ -11,8 +10,7 @@ from typing import Any, Literal
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.figures.canvas import save
 from magtwin.figures.page import write_page
-from magtwin.figures.reports import NamedRun, draw_comparison, page_of_comparison, page_of_runs
-from magtwin.files.children import run
+from magtwin.figures.reports import NamedRun, draw_comparison, page_of_runs
 from magtwin.files.file import existing
 from magtwin.files.outputs import check_free
 from magtwin.io.convert import twin_to_show
@@ -31,7 +29,7 @@ Source = str | Path
 
 
 def view(files: Sequence[Source], *, scene: Source | None = None) -> None:
-    """Show runs in the Rerun viewer, or a stage in usdview or a window, until it is closed.
+    """Show runs in the Rerun viewer, or a stage in a window, until it is closed.
 
     Args:
         files: Runs in any format, on one timeline; or one stage.
@@ -68,7 +66,7 @@ def picture(
     Args:
         file: Run in any format, stage, or recording.
         out: PNG to write.
-        camera: "orbit", "top", "chase" or "x,y,z:x,y,z" [m]. None: orbit; a recording uses the Rerun viewer.
+        camera: "orbit", "top" or "x,y,z:x,y,z" [m]. None: orbit; a recording uses the Rerun viewer.
         time_s: Moment of a run or recording [s]. None: its end, or where the viewer starts.
         size: Width and height [pixels].
         scene: Scene of a run. None: the one of the metadata.
@@ -91,8 +89,6 @@ def picture(
 
         return screenshot(file, out, time_s=time_s, size=size, force=force)
     if file.suffix.lower() in STAGES and time_s is None and scene is None:
-        if camera == "chase":
-            raise InputError(f"{file}: a stage has no run to follow; take another camera", parameter="camera")
         seen = None if camera is None else View.of(camera).camera()
         picture_of_stage(file, out, size=size, camera=seen, force=force)
     else:
@@ -142,7 +138,7 @@ def report_runs(
 
     Args:
         runs: Runs in any format; a folder that `magtwin sweep` made stands for its runs.
-        out: Page to write (.html, .md or .json).
+        out: Page to write (.html).
         scene: Scene of the map below the paths. None: the one of each run's metadata.
         force: Whether an existing page is replaced.
         progress: Called with the number of runs done, the number in all and the current step.
@@ -168,9 +164,9 @@ def report_runs(
                 warnings.warn(f"{file}: its map is not shown: {error}", MismatchWarning, stacklevel=2)
         name = file.name if names.count(file.name) == 1 else str(file)
         named.append(NamedRun(name, run, field, planned_of(run, near=file), note))
-    pictured = out.suffix.lower() == ".html" and len(named) <= MOST_PICTURED
+    pictured = len(named) <= MOST_PICTURED
     page = page_of_runs(named, pictures=pictured, advance=lambda done: progress(done, len(named), "drawing"))
-    if out.suffix.lower() == ".html" and not pictured:
+    if not pictured:
         page = replace(page, lead=f"{page.lead} Pages of more than {MOST_PICTURED} runs have no pictures.")
     write_page(page, out, force=force)
 
@@ -183,13 +179,13 @@ def compare_files(
     out: Source | None = None,
     force: bool = False,
 ) -> Comparison:
-    """Compare two runs, and write a page or a picture of the comparison.
+    """Compare two runs, and draw the comparison.
 
     Args:
         a: First run, in any format.
         b: Second run.
         align: As for `magtwin.run.compare.compare`.
-        out: Page (.html, .md, .json) or picture (.png, .svg) to write.
+        out: Picture to draw (.png, .svg).
         force: Whether an existing output is replaced.
 
     Raises:
@@ -199,10 +195,8 @@ def compare_files(
     name_a, name_b = names_of(a, b)
     named = NamedRun(name_a, read_run(a)), NamedRun(name_b, read_run(b))
     comparison = compare(named[0].run, named[1].run, align=align)
-    if out is not None and Path(out).suffix.lower() in (".png", ".svg"):
+    if out is not None:
         save(draw_comparison(*named, comparison), out, force=force)
-    elif out is not None:
-        write_page(page_of_comparison(*named, comparison), out, force=force)
     return comparison
 
 
@@ -262,11 +256,7 @@ def _view_stage(file: Path) -> None:
     from magtwin.usd.animation import is_animation
 
     existing(file, "stage")
-    if usdview := shutil.which("usdview"):
-        result = run([usdview, str(file)], capture_output=False)
-        if result.returncode:
-            raise InputError(f"{file}: usdview ended with status {result.returncode}")
-    elif file.suffix.lower() != ".usdz" and is_animation(file):
+    if file.suffix.lower() != ".usdz" and is_animation(file):
         _view_run(file, file)
     else:
         from magtwin.figures.pictures import show_stage

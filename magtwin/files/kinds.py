@@ -58,7 +58,7 @@ WEIGHTS = Kind("a network", "magtwin info {file} describes it, and magtwin evalu
 ONNX = Kind("a network as ONNX, which runs without magtwin", "give its .safetensors or .pth")
 CHECKPOINT = Kind("a PyTorch checkpoint", "magtwin network convert {file} --out F.safetensors converts it")
 PATH = Kind("a path", "magtwin run SCENE --path {file} drives it")
-COMMANDS = Kind("a file of commands", "magtwin run SCENE --commands {file} drives them")
+COMMANDS = Kind("a file of commands", "magtwin run SCENE --path {file} drives them")
 MODEL = Kind("a Tolles-Lawson model", "magtwin compensate apply RUN {file} --out F.parquet applies it")
 JSON = Kind("a JSON", "give another file")
 PICTURE = Kind("a picture or film", "give the file that it was drawn from")
@@ -110,7 +110,7 @@ _REMEDIES = {
         STAGE,
     ): "give the survey that the map was made of, or survey a scene: magtwin map survey",
     ("data set", SWEEP): "build one first: magtwin dataset build {file} --map MAP --out SET",
-    ("scene", RUN): "give the scene; magtwin run SCENE --replay {file} repeats a run in it",
+    ("scene", RUN): "give the scene; magtwin run SCENE --path {file} repeats a run in it",
     ("USD file", RUN): "magtwin convert {file} F.usda makes one of it; if a scene is meant, give that",
 }
 """Better remedies for single pairs of what is needed and what was given."""

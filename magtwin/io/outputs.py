@@ -1,17 +1,20 @@
 """Outputs of a run: drive a scene, and write every file that was asked for, or none."""
 
+import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 from magtwin.errors import InputError
+from magtwin.files.file import existing
+from magtwin.files.kinds import COMMANDS, RUN, kind_of
 from magtwin.files.outputs import check_free, output, transaction
-from magtwin.io.formats import format_of, format_to_write, read_run, write_run
-from magtwin.path import CASES, PATHS
+from magtwin.io.formats import FORMATS, format_of, format_to_write, read_run, write_run
+from magtwin.path import CASES, PATHS, read_path_csv
 from magtwin.path import Path as Planned
 from magtwin.path.room import FLOOR_M
 from magtwin.run.run import Run
@@ -42,12 +45,35 @@ class Driven:
     scans: "Scans | None" = None
 
 
+def driven_by(path: str) -> "str | Commands | Run":
+    """What a text tells a robot to drive: the name of a path, or a file of x,y, as it is; commands; or a run.
+
+    A file with a header t,v,w holds commands, as does one that is no path and can be read as commands.
+
+    Raises:
+        InputError: The file is none of these.
+    """
+    if path in (*PATHS, *CASES, "random") or not os.path.lexists(path):
+        return path
+    file = existing(path, "path file")
+    kind = kind_of(file)
+    if file.is_dir() or file.suffix.lower() in {*FORMATS} - {".csv"} or kind is RUN:
+        return read_run(file)
+    if kind is COMMANDS:
+        return read_commands(file)
+    try:
+        read_path_csv(file)
+    except InputError:
+        with suppress(InputError):
+            return read_commands(file)
+        raise
+    return path
+
+
 def drive(
     scene_file: str | Path,
-    path: str = "figure8",
+    path: "str | Commands | Run" = "figure8",
     *,
-    commands: str | Path | None = None,
-    replay: str | Path | None = None,
     seed: int = 0,
     session: Session | None = None,
     plant: PlantSpec | str | None = None,
@@ -61,9 +87,7 @@ def drive(
 
     Args:
         scene_file: The stage.
-        path: Path, as for `magtwin.simulate`.
-        commands: CSV of commands to drive by, in place of the path.
-        replay: Run to drive again, in place of the path.
+        path: What to drive, as from `driven_by`.
         seed: Seed of all noise.
         session: As for `magtwin.simulate`.
         plant: As for `magtwin.simulate`.
@@ -76,25 +100,17 @@ def drive(
     Raises:
         InputError: As for `magtwin.simulate`, or a file cannot be read.
     """
-    what: Any = path
-    if commands is not None:
-        what = read_commands(Path(commands))
-    elif replay is not None:
-        what = read_run(replay)
-        metadata = {"replay_file": Path(replay).as_posix(), **metadata}
-    elif path != "random":
-        drive_input(path)  # refuses a wrong name before the scene is opened
+    drive_input(path)  # refuses a wrong name before the scene is opened
     twin = open_twin(scene_file, **{name: options.pop(name) for name in OPENING if name in options})
     twin = in_session(with_plant(twin, plant), session, seed=seed)
-    planned = None
-    if what is path and path != "random":
-        what = planned = drive_input(path, room_of(twin), fit=fit)
-        if isinstance(planned, Planned) and planned.placing:
-            how = _placing(planned.placing, named=str(path) in (*PATHS, *CASES))
-            report(f"Path {planned.name} is {how} to fit this floor and what stands on it")
+    what = drive_input(path, room_of(twin), fit=fit)
+    planned = what if isinstance(what, Planned) else None
+    if planned is not None and planned.placing:
+        how = _placing(planned.placing, named=path in (*PATHS, *CASES))
+        report(f"Path {planned.name} is {how} to fit this floor and what stands on it")
     if isinstance(what, Commands) and (text := what.beyond(twin.scene.robot.drive)):
         report(text)
-    report(f"Driving {getattr(planned, 'name', None) or path}")
+    report(f"Driving {getattr(what, 'name', 'random' if what == 'random' else 'as recorded')}")
     run = simulate(twin, what, seed=seed, **options).with_metadata(**metadata)
     if scans:
         report("Casting the LiDAR's rays")

@@ -9,6 +9,8 @@ part can be read alone, and byte-stream-split encoding works. Arrow fields have 
 import json
 import sys
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,31 @@ from magtwin.run.resample import RULES
 from magtwin.run.run import COLUMNS, Column, Metadata, Run, check_clock
 
 FACTS = b"magtwin_facts"
+
+
+@contextmanager
+def without_pandas() -> Iterator[None]:
+    """Keep pyarrow from importing pandas, for a third of a second, in a block that makes arrays of lists."""
+    shim = getattr(pa.lib, "_pandas_api", None)
+    if shim is None or "pandas" in sys.modules:
+        yield
+        return
+
+    class Finder:
+        @staticmethod
+        def find_spec(name: str, *_: Any) -> None:
+            if name == "pandas":
+                raise ImportError
+
+    sys.meta_path.insert(0, Finder)  # type: ignore[arg-type]
+    try:
+        pa.array([])  # looks for pandas once
+    finally:
+        sys.meta_path.remove(Finder)  # type: ignore[arg-type]
+    try:
+        yield
+    finally:
+        shim.__init__()  # looks again when asked
 
 
 def table_of(run: Run) -> pa.Table:

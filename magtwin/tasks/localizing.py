@@ -603,15 +603,7 @@ def check_on_map(run: Run, belief: FieldBelief, lever_arm_m: tuple[float, float]
 
 
 def _layer_of(file: Path) -> Path | None:
-    """The layer that holds the map of a file; None for a folder of CSVs, or a stage that is no scene."""
-    if file.is_dir():
-        return None
-    from magtwin.usd.maps.layer import is_map_layer
-    from magtwin.usd.scene import read_scene
+    """The layer that holds the map of a file; None for a folder of CSVs, or a stage of several maps."""
+    from magtwin.usd.maps.layer import layer_of_map
 
-    if is_map_layer(file):
-        return file
-    try:
-        return Path(read_scene(file, check_network=False).map_layer)
-    except InputError:
-        return None
+    return None if file.is_dir() else layer_of_map(file)

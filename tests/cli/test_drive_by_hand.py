@@ -102,7 +102,7 @@ def test_a_drive_at_a_terminal_is_recorded_and_leaves_the_terminal_as_it_was(tmp
     assert not termios.tcgetattr(theirs)[3] & termios.ICANON  # keys come one by one
     for key in (b"w", b"w", b"\x1b[D", end):
         os.write(ours, key)
-        time.sleep(1.0)  # the loop reads one key after the other also on a busy machine
+        time.sleep(0.4)  # the loop reads one key after the other also on a busy machine
     _, error = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, error
     assert termios.tcgetattr(theirs) == before
@@ -112,26 +112,12 @@ def test_a_drive_at_a_terminal_is_recorded_and_leaves_the_terminal_as_it_was(tmp
     assert run["p_world_base"][-1, 0] > 0.01
     assert np.abs(run["w_cmd"]).max() == 0.25
     commands, parquet = tmp_path / "d" / "commands.csv", tmp_path / "again.parquet"
-    options = ["--network", "none", "--json", "--commands", str(commands), "--out", str(parquet)]
+    options = ["--network", "none", "--json", "--path", str(commands), "--out", str(parquet)]
     main(["run", str(lab_scene), *options])
     again = read_parquet(tmp_path / "again.parquet")
     for name in run:
         assert_array_equal(again[name], run[name], err_msg=name)
     assert read_commands(tmp_path / "d" / "commands.csv").rows[-1, 1] == 0.0
-
-
-def test_a_gamepad_that_is_not_there_is_refused(tmp_path, lab_scene, capsys):
-    with pytest.raises(SystemExit):
-        main(["drive", str(lab_scene), "--out", str(tmp_path / "d"), "--gamepad", str(tmp_path / "js0")])
-    assert "no such gamepad" in capsys.readouterr().err
-    assert not (tmp_path / "d").exists()
-
-
-def test_a_folder_is_no_gamepad(tmp_path, lab_scene, capsys):
-    with pytest.raises(SystemExit):
-        main(["drive", str(lab_scene), "--gamepad", str(tmp_path), "--out", str(tmp_path / "d"), "--no-live"])
-    assert f"{tmp_path}: a folder; name a gamepad in it" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
 
 
 def _drawn(client):

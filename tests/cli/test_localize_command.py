@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -32,15 +33,6 @@ def here(place: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(place)
     monkeypatch.setattr(sys, "path", list(sys.path))
     return place
-
-
-def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line of a refusal."""
-    with pytest.raises(SystemExit) as ended:
-        main(arguments)
-    assert ended.value.code == 1
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("magtwin: ")]
-    return lines[-1]
 
 
 def test_a_new_localizer_runs_as_it_stands_and_beats_dead_reckoning(
@@ -171,12 +163,12 @@ def test_a_network_predicts_the_own_field_at_the_poses_of_a_first_pass(here: Pat
     ],
 )
 def test_a_wrong_input_is_refused_in_one_line(
-    here: Path, capsys: pytest.CaptureFixture[str], given: list[str], said: str
+    here: Path, refusal: Callable[..., str], given: list[str], said: str
 ) -> None:
     arguments = ["localize", "run.parquet", "--quiet"]
     for option, default in (("--map", "lab"), ("--method", "odometry"), ("--out", "refused")):
         arguments += [] if option in given else [option, default]
-    assert said in refused([*arguments, *given], capsys)
+    assert said in refusal(*arguments, *given)
     assert not (here / "refused").exists()
 
 

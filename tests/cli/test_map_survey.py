@@ -73,39 +73,3 @@ def test_a_survey_becomes_readings_whose_headings_deviate(lab_scene, tmp_path):
     off = np.degrees(read.yaw - np.asarray(read.grid.headings_rad)[read.node[:, 0]])
     assert off.std() == pytest.approx(7, rel=0.15)
     assert (len(read), read.height_m, read.name) == (416, 0.2, "survey")
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--spacing-m", "0"], "--spacing-m must be above 0 m"),
-        (["--spacing-m", "9"], "--spacing-m 9 leaves no cell on 6 x 3.5 m"),
-        (["--headings-deg", "north"], "headings are degrees with commas between"),
-        (["--readings", "0"], "readings must be at least 1"),
-        (["--seed", "-1"], "seed must be a whole number from 0 up"),
-        (["--height-m", "nan"], "--height-m must be a height above the floor, 0 m or more"),
-        (["--position-error-m", "-1"], "--position-error-m must not be below 0"),
-    ],
-)
-def test_a_survey_that_cannot_be_made_is_refused_in_one_line_and_nothing_is_written(
-    lab_scene, tmp_path, capsys, options, said
-):
-    with pytest.raises(SystemExit) as end:
-        run(lab_scene, "--out", tmp_path / "m.usdc", *options)
-    assert end.value.code == 1
-    line = capsys.readouterr().err.strip().splitlines()[-1]
-    assert line.startswith("magtwin: ")
-    assert said in line
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_outputs_are_kept_and_other_suffixes_refused(lab_scene, tmp_path, capsys):
-    (tmp_path / "m.usdc").write_text("mine")
-    for out, said in (
-        (tmp_path / "m.usdc", "exists already; give --force"),
-        (tmp_path / "m.csv", "ends in .usdc"),
-    ):
-        with pytest.raises(SystemExit):
-            run(lab_scene, "--out", out)
-        assert said in capsys.readouterr().err
-    assert (tmp_path / "m.usdc").read_text() == "mine"

@@ -43,7 +43,7 @@ def test_a_missing_scene_that_was_named_is_refused(run, elsewhere, scene):
 def test_a_scene_whose_map_is_not_that_of_the_run_is_reported(run, elsewhere):
     load_run(run).with_metadata(map_sha256="0" * 64).save("other.parquet")
     with pytest.warns(UserWarning, match="its map is not shown: .*is not the map of the run"):
-        report_runs(["other.parquet"], "z.md", scene="lab")
+        report_runs(["other.parquet"], "z.html", scene="lab")
 
 
 def test_the_name_of_a_shipped_scene_is_its_stage_and_its_map(run, elsewhere, capsys):

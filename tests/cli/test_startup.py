@@ -47,7 +47,8 @@ def folder(tmp_path_factory):
         ("convert x.parquet --out x.csv", f"torch numba pxr scipy pandas {PICTURES}"),
         ("reproduce x.parquet", f"torch numba scipy pandas {PICTURES}"),
         ("report x.parquet --out report.html", "torch numba scipy pandas rerun sympy"),
-        ("localize x.parquet --map lab --out localized", f"torch sympy {SCIPY_PARTS}"),
+        ("run lab --duration-s 2 --out run", f"torch numba pandas {SCIPY_PARTS} sympy"),
+        ("localize x.parquet --map lab --out localized", f"torch pandas sympy {SCIPY_PARTS}"),
     ],
 )
 def test_a_command_loads_no_library_that_it_does_not_need(folder, command, refused):

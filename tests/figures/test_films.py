@@ -1,7 +1,6 @@
 """Pictures and films of runs in their lab."""
 
 import itertools
-import re
 import stat
 from dataclasses import replace
 
@@ -15,7 +14,7 @@ from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.figures.films import LONGEST_S, film_of_run, frame_times
 from magtwin.figures.pictures import VEIL
-from magtwin.figures.scenery import WALL_M, Scenery, View, _free_share, picture_of_run
+from magtwin.figures.scenery import Scenery, View, picture_of_run
 from magtwin.files.file import shipped
 from magtwin.io.tables import write_parquet
 from magtwin.run.run import Run
@@ -117,32 +116,8 @@ def test_the_robot_is_seen_behind_a_column_in_every_frame(run, lab_scene):
             assert near < 0.6 * far  # 0.30 to 0.48 seen: 0.3 but for the posts
 
 
-def test_the_camera_that_follows_stays_on_the_robots_side_of_a_wall():
-    wall = np.array([[[-1.0, -2.0, 0.0], [-0.9, 2.0, 2.5]]])
-    p = np.array([0.0, 0.0, 0.75])
-    share = _free_share(p, np.array([-1.3, 0.0, 0.0]), wall)
-    assert 1.3 * share == pytest.approx(0.9 - WALL_M)
-    assert _free_share(p, np.array([1.3, 0.0, 0.0]), wall) == 1
-    assert _free_share(p + np.array([0.0, 0.0, 2.0]), np.array([-1.3, 0.0, 0.0]), wall) == 1  # above it
-    assert _free_share(p, np.array([-1.3, 0.0, 0.0]), np.empty((0, 2, 3))) == 1
-
-
-def test_the_words_of_a_frame_are_rounded(run, lab_scene):
-    back = run.with_columns(v_base=np.where(np.arange(3) < 1, -1e-9, run["v_base"]))
-    with Scenery(back, lab_scene, [1.23000001], view=View.of("top"), size=SIZE, speed=2.459753) as scenery:
-        (words,) = scenery._words
-    assert re.fullmatch(r"1\.2 s   \d\d\.\d\d µT   0\.00 m/s   x2\.46", words)
-
-
-def test_frames_come_again_the_same_and_in_any_order(scenery):
-    early = scenery.frame(1).copy()
-    scenery.frame(5)
-    np.testing.assert_array_equal(scenery.frame(1), early)
-
-
-@pytest.mark.parametrize("camera", ["chase", "2,-3,1.5:0,0,0"])
-def test_cameras_that_follow_or_stand_see_the_robot(run, lab_scene, camera):
-    with Scenery(run, lab_scene, [1.0, 4.0], view=View.of(camera), size=SIZE) as scenery:
+def test_a_camera_that_stands_sees_the_robot(run, lab_scene):
+    with Scenery(run, lab_scene, [1.0, 4.0], view=View.of("2,-3,1.5:0,0,0"), size=SIZE) as scenery:
         frames = [scenery.frame(k).astype(int) for k in (0, 1)]
     assert (np.abs(frames[0] - frames[1]) > 40).any(axis=-1).sum() > 50
 
@@ -207,7 +182,7 @@ def test_the_commands_draw_a_moment_a_film_and_a_stage(run, lab_scene, tmp_path,
 @pytest.mark.parametrize(
     ("options", "what"),
     [
-        ({"camera": "sideways"}, "no camera 'sideways'; known: orbit, top, chase; or x,y,z:x,y,z"),
+        ({"camera": "sideways"}, "no camera 'sideways'; known: orbit, top; or x,y,z:x,y,z"),
         ({"camera": "1,2,3:4,5"}, "no camera '1,2,3:4,5'"),
         ({"camera": "1,2,3,4,5,6"}, "no camera '1,2,3,4,5,6'"),
         ({"camera": "nan,2,3:4,5,6"}, "no camera 'nan,2,3:4,5,6'"),

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from magtwin.errors import InputError
-from magtwin.figures.pictures import BACKGROUND, BAR_SHARE, VEIL, Camera, picture_of_stage, view_distance
-from magtwin.files.file import shipped
+from magtwin.figures.pictures import BACKGROUND, VEIL, Camera, picture_of_stage, view_distance
 from magtwin.usd.geometry import srgb_from_linear
 from magtwin.usd.info import info_of_stage
 
@@ -122,8 +121,7 @@ def test_a_maps_colours_reach_the_screen_unchanged_by_light(stage, tmp_path):
     assert np.abs(right - screen[::-1]).max() <= 2
 
 
-@pytest.mark.parametrize("azimuth_deg", [-90, 40, 160])
-@pytest.mark.parametrize("elevation_deg", [15, 36])
+@pytest.mark.parametrize(("azimuth_deg", "elevation_deg"), [(-90, 36), (160, 15)])
 def test_no_wall_or_column_hides_the_map_from_any_side(
     stage, tmp_path, azimuth_deg, elevation_deg, monkeypatch
 ):
@@ -148,33 +146,6 @@ def test_no_wall_or_column_hides_the_map_from_any_side(
     np.testing.assert_allclose(veiled[there], solid[there], atol=8)  # solid elsewhere; drawn() sees from 8 on
 
 
-def test_a_camera_that_fits_a_map_keeps_it_clear_of_the_colour_bar(stage, tmp_path):
-    heat_map(stage, [(0.9, 0.05, 0.0), (0.0, 0.05, 0.9)])
-    barred = draw(stage, tmp_path, camera=Camera(azimuth_deg=-90, elevation_deg=90))
-    blue = (barred[..., 2] > 200) & (barred[..., 0] < 60)  # no colour of viridis
-    columns = np.flatnonzero(blue.any(axis=0))
-    assert columns.size
-    assert columns.max() < (1 - BAR_SHARE) * SIZE[0]
-
-
-def test_a_stage_with_a_map_gets_its_colour_bar(stage, tmp_path):
-    heat_map(stage, [(0.5, 0.1, 0.0), (0.0, 0.1, 0.5)])
-    camera = Camera(azimuth_deg=-90, elevation_deg=90)
-    plain = drawn(draw(stage, tmp_path, camera=camera, legend=False))
-    barred = drawn(draw(stage, tmp_path, camera=camera))
-    right = slice(int(0.9 * SIZE[0]), None)
-    assert not plain[:, right].any()
-    assert barred[:, right].sum() > 100
-
-
-def test_the_turtlebot_is_drawn(tmp_path):
-    out = picture_of_stage(shipped("robots", "turtlebot4", "turtlebot4.usda"), tmp_path / "r.png", size=SIZE)
-    image = pixels(out)
-    blue = (image[..., 2] > image[..., 0] + 60) & (image[..., 2] > 90)
-    assert blue.sum() > 20  # the magnetometer's head
-    assert 0.1 < drawn(image).mean() < 0.6
-
-
 @given(
     st.lists(st.tuples(*[st.floats(-2, 2)] * 3), min_size=1, max_size=8),
     st.tuples(st.floats(0.1, 0.8), st.floats(0.1, 0.8)),
@@ -195,12 +166,6 @@ def test_what_cannot_be_drawn_is_refused(stage, tmp_path):
         picture_of_stage(source, tmp_path / "a.jpg")
     with pytest.raises(InputError, match=r"size must lie in 16\.\.16384 pixels each way, got 0 x 5"):
         picture_of_stage(source, out, size=(0, 5))
-    with pytest.raises(InputError, match=r"elevation_deg of Camera must lie in -90\.\.90, got 91"):
-        Camera(elevation_deg=91)
-    with pytest.raises(InputError, match=r"distance_m of Camera must be above 0, got 0"):
-        Camera(distance_m=0)
-    with pytest.raises(InputError, match=r"view_angle_deg of Camera must lie in 1\.\.120"):
-        Camera(view_angle_deg=0)
     assert not out.exists()
 
 

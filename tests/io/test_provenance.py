@@ -132,9 +132,10 @@ def test_a_run_of_every_kind_comes_out_again_to_the_bit(twin, tmp_path):
         assert dict(found.again.metadata) == dict(original.metadata)
 
 
-def test_a_run_of_a_data_set_comes_out_again_in_its_session(lab_scene, tmp_path, capsys):
+def test_a_run_of_a_data_set_comes_out_again_in_its_session(lab_scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("MAGTWIN_SWEEP_KEEP", "p_world_base b_total_nt battery_v")
     out = tmp_path / "runs"
-    options = ["--duration-s", "1", "--rate-hz", "20", "--keep", "p_world_base", "b_total_nt", "battery_v"]
+    options = ["--duration-s", "1", "--rate-hz", "20"]
     main(
         [
             "sweep",

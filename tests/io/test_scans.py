@@ -87,19 +87,9 @@ def test_the_recording_holds_every_scan_and_is_cleared_when_the_lidar_stops(twin
     assert sum(sizes) == sum(len(points) for points in scans.points_world())
 
 
-def test_the_command_line_writes_scans_beside_the_run(lab_scene, tmp_path):
-    run = [
-        "run",
-        str(lab_scene),
-        "--network",
-        "none",
-        "--duration-s",
-        "2",
-        "--lidar",
-        "on",
-        "--scans",
-        "--json",
-    ]
+def test_the_command_line_writes_scans_beside_the_run(lab_scene, tmp_path, monkeypatch):
+    monkeypatch.setenv("MAGTWIN_RUN_LIDAR", "on")
+    run = ["run", str(lab_scene), "--network", "none", "--duration-s", "2", "--scans", "--json"]
     main([*run, "--out", str(tmp_path / "a.parquet")])
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.parquet", "a.scans.parquet"]
     assert len(read_scans(tmp_path / "a.scans.parquet").t) == 15

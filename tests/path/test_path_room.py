@@ -119,9 +119,10 @@ def test_a_placing_that_is_none_is_refused(placing):
         path_named("sine").placed(placing)
 
 
-def test_a_fitted_run_is_repeated_to_the_bit(lab_scene, tmp_path, capsys):
+def test_a_fitted_run_is_repeated_to_the_bit(lab_scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("MAGTWIN_RUN_RATE_HZ", "5")
     (tmp_path / "far.csv").write_text("0,0\n8,0\n8,1\n")
-    run = ["run", str(lab_scene), "--path", str(tmp_path / "far.csv"), "--rate-hz", "5", "--network", "none"]
+    run = ["run", str(lab_scene), "--path", str(tmp_path / "far.csv"), "--network", "none"]
     with pytest.raises(InputError, match=r"far\.csv leaves the floor .*give `fit=True`"):
         main([*run, "--out", str(tmp_path / "run.parquet"), "--debug"])
     main([*run, "--out", str(tmp_path / "run.parquet"), "--fit"])

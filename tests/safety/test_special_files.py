@@ -35,7 +35,6 @@ COMMANDS = (
     "view F.rrd",
     "run F.usda --out o",
     "run lab --path F.csv --out o",
-    "run lab --commands F.csv --out o",
     "run lab --network F.safetensors --out o",
     "sweep F.usda --out o",
     "scene F.toml --out o",

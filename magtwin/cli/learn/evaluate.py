@@ -39,7 +39,7 @@ def evaluate(
 ) -> Done:
     """Measure the errors of models on recordings, beside the naive model and Tolles and Lawson's.
 
-    Errors are of the total field at the sensor. The report, DIR/evaluation.html, .md and .json, has Table
+    Errors are of the total field at the sensor. The report, DIR/evaluation.html and .json, has Table
     1 with intervals, and the paper's Figures 2, 5, 6 and 7 of these recordings.
 
     Parameters
@@ -113,7 +113,7 @@ def evaluate(
     step("Writing the report")
     page = page_of_evaluation(evaluation, budgets=budgets, both=both)
     write_pages(page, out, NAME, force=force)
-    written = f"Wrote {out}: evaluation.html, evaluation.md, evaluation.json"
+    written = f"Wrote {out}: evaluation.html, evaluation.json"
     return Done(table=lambda: _print(evaluation), text=written, data=loads(to_json(page)))
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Gamepad, Lab, MapLayer, ModelError, Network, Plant, Seed, Session
+from magtwin.cli.options import Force, Gamepad, Lab, MapLayer, Network, Plant, Seed, Session
 from magtwin.cli.runs.run import save_picture
 from magtwin.cli.terminal import Done, announce, note, silence
 from magtwin.errors import InputError
@@ -31,7 +31,6 @@ def drive(
     map_layer: MapLayer = None,
     gamepad: Gamepad = None,
     network: Network = None,
-    model_error: ModelError = True,
     seed: Seed = 0,
     session: Session = None,
     plant: Plant = None,
@@ -42,7 +41,7 @@ def drive(
 
     The kinematic engine moves it from the scene's start. Keys: w/s or up/down for speed, a/d or left/right
     for turning, x to go straight on, space to stop, q to end. It writes run.rrd, run.parquet, run.png and
-    commands.csv, which `magtwin run --commands` drives again to the last bit.
+    commands.csv, which `magtwin run --path` drives again to the last bit.
 
     Parameters
     ----------
@@ -61,7 +60,7 @@ def drive(
     from magtwin.io.outputs import Outputs
     from magtwin.io.outputs import drive as drive_again
     from magtwin.sim.motion.closed_loop import Chassis
-    from magtwin.sim.motion.commands import write_commands
+    from magtwin.sim.motion.commands import read_commands, write_commands
     from magtwin.sim.motion.drive import draw_wheel_errors
     from magtwin.sim.motion.follow import CONTROL_RATE_HZ, STAND, loop_by_commands
     from magtwin.sim.motion.manual import HELP, Gamepad, Keyboard, Recorder
@@ -74,7 +73,7 @@ def drive(
             raise InputError(f"{gamepad}: a folder; name a gamepad in it, such as /dev/input/js0")
         raise InputError(f"{gamepad}: not a gamepad; name one, such as /dev/input/js0")
     with output(out, force=force) as folder:
-        twin = open_twin(scene, lab=lab, map_layer=map_layer, network=network, model_error=model_error)
+        twin = open_twin(scene, lab=lab, map_layer=map_layer, network=network)
         twin = with_plant(twin, plant)
         twin = in_session(twin, session, seed=seed)
         robot, dt = twin.scene.robot, 1.0 / CONTROL_RATE_HZ
@@ -101,11 +100,10 @@ def drive(
         write_commands(recorder.commands("commands.csv"), folder / "commands.csv")
         driven = drive_again(
             scene,
-            commands=folder / "commands.csv",
+            read_commands(folder / "commands.csv"),
             lab=lab,
             map_layer=map_layer,
             network=network,
-            model_error=model_error,
             seed=seed,
             session=session,
             plant=plant,
@@ -113,7 +111,7 @@ def drive(
             report=announce,
         )
         Outputs(folder, picture=save_picture).write(driven)
-    again = f"magtwin run {scene} --commands {out / 'commands.csv'} --seed {seed}"
+    again = f"magtwin run {scene} --path {out / 'commands.csv'} --seed {seed}"
     options = {"lab": lab or None, "map": map_layer, "session": session, "plant": plant}
     again += "".join(f" --{name} {value}" for name, value in options.items() if value is not None)
     return Done(driven.run.report(f"Manual drive in {scene}"), out, text=f"Wrote {out}; again: {again}")

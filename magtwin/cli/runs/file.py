@@ -35,7 +35,7 @@ def view(
     """Show runs or a stage in a viewer until it is closed.
 
     Runs are shown in the Rerun viewer, in their lab if their scene is found. Several runs share one timeline,
-    each in its colour. A stage is shown in usdview if that is installed, else in a window.
+    each in its colour. A stage is shown in a window.
 
     Parameters
     ----------

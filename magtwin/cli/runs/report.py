@@ -1,5 +1,6 @@
-"""`magtwin report` and `magtwin compare`."""
+"""`magtwin report`, `compare` and `reproduce`."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -7,7 +8,16 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force, RunScene
-from magtwin.cli.terminal import Done, check_output, progress, stdout_console, step
+from magtwin.cli.terminal import (
+    Done,
+    announce,
+    check_output,
+    print_report,
+    progress,
+    say,
+    stdout_console,
+    step,
+)
 
 if TYPE_CHECKING:
     from magtwin.run.compare import Comparison
@@ -30,11 +40,11 @@ def report(
     runs
         Runs in any format that magtwin reads; a folder that `magtwin sweep` made stands for all of its runs.
     out
-        Page to write: .html, which needs no other file, .md or .json.
+        Page to write (.html); it needs no other file.
     """
     from magtwin.figures.views import report_runs
 
-    check_output(out, (".html", ".md", ".json"), "a report", force=force)
+    check_output(out, (".html",), "a report", force=force)
     with progress("Reporting", "runs") as advance:
         report_runs(runs, out, scene=scene, force=force, progress=advance)
     return Done(wrote=out)
@@ -61,15 +71,41 @@ def compare(
         time: shift the clocks so that the positions agree best. path: align by distance driven, for runs of
         different speeds. none: keep the clocks.
     out
-        Page (.html, .md, .json) or picture (.png, .svg) to write: readings as recorded and aligned, the
-        distance between the runs, and both paths.
+        Picture to draw (.png, .svg): readings as recorded and aligned, the distance between the runs, and
+        both paths.
     """
     from magtwin.figures.views import compare_files, names_of
 
-    check_output(out, (".html", ".md", ".json", ".png", ".svg"), "a comparison", force=force)
+    check_output(out, (".png", ".svg"), "a comparison", force=force)
     step("Comparing the runs")
     comparison = compare_files(a, b, align=align, out=out, force=force)
     return Done(comparison, out or (), table=lambda: _print(comparison, names_of(a, b)))
+
+
+@app.command
+def reproduce(file: Path, *, scene: RunScene = None) -> Done:
+    """Reproduce a run from its metadata and report whether the bytes match.
+
+    It names what has changed since (scene, map, network, versions), and each column that differs and by how
+    much. Exit status: 0 if all columns are equal, else 1.
+
+    Parameters
+    ----------
+    file
+        A run in any format that magtwin writes.
+    """
+    from magtwin.io.provenance import repeat_of
+
+    announce("Reproducing the run")
+    found = repeat_of(file, scene)
+    report = found.report(f"{file}, reproduced")
+
+    def table() -> None:
+        for cause in found.causes:
+            say(cause)
+        print_report(replace(report, metadata={}))
+
+    return Done(report, table=table, status=0 if found.equal else 1)
 
 
 def _print(comparison: "Comparison", names: tuple[str, str]) -> None:

@@ -11,20 +11,18 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import (
-    SENSING,
     Flag,
     Force,
     Lab,
+    Magnetometer,
     MapLayer,
-    ModelError,
-    OutUnit,
+    Network,
     Plant,
     Seed,
-    SensingOptions,
     Session,
-    UsdFps,
     check_pace,
 )
+from magtwin.cli.settings import RUN, RunOptions, RunSettings
 from magtwin.cli.terminal import Done, announce, note, progress, step
 from magtwin.errors import InputError, find
 
@@ -35,9 +33,7 @@ Outs = Annotated[list[Path] | None, Parameter(consume_multiple=False)]
 
 
 @app.command
-def demo(
-    *, out: Path = Path("demo"), seed: Seed = 0, model_error: ModelError = True, force: Force = False
-) -> Done:
+def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False) -> Done:
     """Author a lab and a TurtleBot 4, drive a figure of eight and log what the magnetometer reads.
 
     It writes the stages, run.rrd (opens in Rerun), run.parquet and pictures, in less than a minute.
@@ -65,7 +61,7 @@ def demo(
         scene = replace(scene, robot=replace(scene.robot, asset=asset))
         scene_file = author_scene(scene, folder / "scene")
         relative = {"scene_file": scene_file.relative_to(folder).as_posix()}
-        driven = drive(scene_file, seed=seed, model_error=model_error, metadata=relative, report=announce)
+        driven = drive(scene_file, seed=seed, metadata=relative, report=announce)
         announce("Writing the run and pictures")
         Outputs(folder, picture=save_picture).write(driven)
         try:
@@ -83,30 +79,26 @@ def run(
     *,
     path: str | None = None,
     fit: Flag = False,
-    commands: Path | None = None,
     lab: Lab = "",
     map_layer: MapLayer = None,
     robot: str | None = None,
-    meet: Literal["refuse", "flag"] | None = None,
     engine: Literal["kinematic", "newton"] = "kinematic",
-    replay: Path | None = None,
-    controller: Literal["follower", "release"] = "follower",
-    sensing: SensingOptions = SENSING,
-    seed: Seed = 0,
-    session: Session = None,
+    network: Network = None,
+    magnetometer: Magnetometer = None,
     plant: Plant = None,
+    session: Session = None,
+    seed: Seed = 0,
     speed: float = 0.2,
     duration_s: float | None = None,
-    out: Outs = None,
-    out_unit: OutUnit = None,
-    usd_fps: UsdFps = None,
-    scans: Flag = False,
     live: Flag = False,
-    viewer: str | None = None,
-    pace: float | None = None,
+    scans: Flag = False,
+    out: Outs = None,
+    settings: RunOptions = RUN,
     force: Force = False,
 ) -> Done:
     """Drive a scene's robot along a path and write the run.
+
+    Rarer settings, such as rate_hz, lidar and controller, are keys of [run] in magtwin.toml: docs/runs.md.
 
     Parameters
     ----------
@@ -114,27 +106,17 @@ def run(
         USD stage to drive in, or the name of a scene that ships with magtwin: lab.
     path
         sine, fast_sine, lawnmower, split_lawnmower, figure8, narrow_figure8, continuous_cycle, loops,
-        curvilinear, curvilinear_2; A to E (Table 1 of
-        Penumarti et al. 2025); random (like a human driver, for one minute or --duration-s); or a CSV file of
-        x,y [m]. Named paths are scaled to the floor. Default: the path of the
-        scene, else figure8.
+        curvilinear, curvilinear_2; A to E (Table 1 of Penumarti et al. 2025); random (like a human driver,
+        for one minute or --duration-s); a CSV file of x,y [m]; a CSV file of commands t,v,w
+        [s, m/s, rad/s], as `magtwin drive` writes; or a run, whose motion is repeated. Named paths are scaled
+        to the floor. Default: the path of the scene, else figure8.
     fit
         Move and shrink the path until it fits the floor and its obstacles.
-    commands
-        CSV file of commands t,v,w [s, m/s, rad/s] to drive instead of a path; `magtwin drive` writes one.
     robot
-        In a scene of several robots: the robot that --path, --commands or --replay applies to. Only its run
-        is written; the other robots drive their paths in the scene. Default: write every run, as
-        run.NAME.rrd and so on.
-    meet
-        What happens if robots collide: refuse the run, or flag it as a bump. Default: refuse.
+        In a scene of several robots: the robot that --path applies to. Only its run is written; the other
+        robots drive their paths in the scene. Default: write every run, as run.NAME.rrd and so on.
     engine
         What moves the robot: kinematic (motion without forces), or newton (the physics engine Newton).
-    replay
-        File of a run, in any format. The robot repeats the recorded motion; the sensors use the current
-        settings.
-    controller
-        follower (magtwin's own controller) or release (that of APRILab's published package).
     speed
         Forward speed on straight parts [m/s].
     duration_s
@@ -149,14 +131,9 @@ def run(
         .npz, the scans go into a second file such as run.scans.parquet.
     live
         Show the run in a Rerun viewer, in step with the clock, once it is written. Ctrl-C ends it.
-    viewer
-        Address of a running Rerun viewer that shows the run, such as rerun+http://127.0.0.1:9876/proxy.
-    pace
-        Simulated seconds per second of the live display. Default: 1.
     """
     from magtwin.files.kinds import scene_file
-    from magtwin.io.outputs import Outputs, drive
-    from magtwin.sim.runs.simulate import check_asked
+    from magtwin.io.outputs import Outputs, driven_by
     from magtwin.usd.scene import robots_in
 
     scene = scene_file(scene)
@@ -164,90 +141,104 @@ def run(
         out or [Path("run")],
         scans=scans,
         force=force,
-        out_unit=out_unit,
-        usd_fps=usd_fps,
+        out_unit=settings.out_unit,
+        usd_fps=settings.usd_fps,
         picture=save_picture,
     )
-    if live and viewer:
-        raise InputError("--live opens a viewer and --viewer names one; give one of them")
-    if pace is not None and not (live or viewer):
-        raise InputError("--pace is for a run that is shown; give --live, or drop it")
-    if pace is not None:
-        check_pace(pace)
-    what = _what(path, commands, replay)
-    free = commands or replay  # driven without a path
-    no_path = free or path == "random"
-    for given, option, fault in (
-        (controller != "follower" and no_path, f"--controller {controller}", "follows a path"),
-        (speed != 0.2 and free, "--speed", "is for a path or a driver"),
-        (fit and no_path, "--fit", "is for a path"),
-        (engine == "newton" and replay, "--engine newton", "cannot repeat the motion of a run"),
-    ):
-        if given:
-            raise InputError(f"{option} {fault}, and {what} is none; drop one")
-    check_asked(duration_s, sensing.rate_hz, speed)
-    if engine == "newton":
-        from magtwin.sim.engines.newton import check_installed
-
-        check_installed()
-    if viewer:
-        from magtwin.io.rerun.live import check_listens
-
-        check_listens(viewer)
-    options: dict[str, Any] = {"commands": commands, "replay": replay, "seed": seed, "session": session}
-    options |= {"plant": plant, "speed": speed, "duration_s": duration_s, "controller": controller}
-    options |= vars(sensing)
+    what = None if path is None else driven_by(path)
+    options: dict[str, Any] = {"seed": seed, "session": session, "plant": plant, "speed": speed}
+    options |= {"duration_s": duration_s, "network": network, "magnetometer": magnetometer, "fit": fit}
+    options |= {name: getattr(settings, name) for name in SIMULATED}
+    options |= {"lab": lab, "map_layer": map_layer, "scans": scans}
+    _check(what, path or "figure8", settings, options, live=live, engine=engine)
     robots = robots_in(scene, lab=lab)
     if robot is not None:
         find("robot", robot, robots)
     if len(robots) > 1:
         names = ", ".join(robots)
-        if live or viewer:
-            raise InputError(f"--live and --viewer show one robot, and {scene} has {names}")
+        if live or settings.viewer:
+            raise InputError(f"--live and `viewer` show one robot, and {scene} has {names}")
         if engine == "newton":
             raise InputError(f"--engine newton drives one robot by itself, and {scene} has {names}; drop it")
-        if robot is None and (path or free or fit):
-            raise InputError(f"which of {names} is to drive {what}? name it with --robot NAME")
-        return _run_robots(
-            scene,
-            outputs,
-            lab=lab,
-            map_layer=map_layer,
-            robot=robot,
-            path=path,
-            fit=fit,
-            meet=meet,
-            scans=scans,
-            **options,
-        )
-    if meet is not None:
-        raise InputError(f"--meet is for several robots, and {scene} has one; drop it")
-    if not (path or free):
-        what = str(next(iter(robots.values())) or what)
+        if robot is None and (path or fit):
+            raise InputError(f"which of {names} is to drive {path or 'figure8'}? name it with --robot NAME")
+        return _run_robots(scene, outputs, what, robot=robot, meet=settings.meet or "refuse", **options)
+    if settings.meet is not None:
+        raise InputError(f"`meet` is for several robots, and {scene} has one; drop it")
+    if what is None:
+        what = path = str(next(iter(robots.values())) or "figure8")
     step("Opening the scene")
+    driven = _run_one(scene, outputs, what, path, settings, live=live, engine=engine, **options)
+    return Done(driven.run.report(f"{path} in {scene}"), tuple(outputs.targets))
+
+
+SIMULATED = ("model_error", "tracking_error", "lidar", "outside", "rate_hz", "controller")
+"""Settings that are parameters of `open_twin` and `simulate`."""
+
+
+def _check(
+    what: Any, path: str, settings: RunSettings, options: dict[str, Any], *, live: bool, engine: str
+) -> None:
+    """Refuse options that are for another way of driving, and those that would be refused late."""
+    from magtwin.run.run import Run
+    from magtwin.sim.runs.simulate import check_asked
+
+    if live and settings.viewer:
+        raise InputError("--live opens a viewer and `viewer` names one; give one of them")
+    if settings.pace is not None:
+        if not (live or settings.viewer):
+            raise InputError("`pace` is for a run that is shown; give --live, or drop it")
+        check_pace(settings.pace)
+    controller, newton = settings.controller, engine == "newton"
+    free = what is not None and not isinstance(what, str)  # driven without a path
+    no_path = free or what == "random"
+    for given, option, fault in (
+        (controller != "follower" and no_path, f"`controller={controller}`", "follows a path"),
+        (options["speed"] != 0.2 and free, "--speed", "is for a path or a driver"),
+        (options["fit"] and no_path, "--fit", "is for a path"),
+        (newton and isinstance(what, Run), "--engine newton", "cannot repeat the motion of a run"),
+    ):
+        if given:
+            raise InputError(f"{option} {fault}, and {path} is none; drop one")
+    check_asked(options["duration_s"], settings.rate_hz, options["speed"])
+    if newton:
+        from magtwin.sim.engines.newton import check_installed
+
+        check_installed()
+    if settings.viewer:
+        from magtwin.io.rerun.live import check_listens
+
+        check_listens(settings.viewer)
+
+
+def _run_one(
+    scene: Path,
+    outputs: "Outputs",
+    what: Any,
+    path: str | None,
+    settings: RunSettings,
+    *,
+    live: bool,
+    engine: str,
+    **options: Any,
+) -> "Driven":
+    """Drive the only robot of a scene, show the run if asked for, and write it."""
+    from magtwin.io.outputs import drive
+    from magtwin.run.run import Run
+
+    newton = engine == "newton"
+    replayed = {"replay_file": Path(str(path)).as_posix()} if isinstance(what, Run) else {}
     with ExitStack() as stack:
         keep = stack.enter_context(outputs.kept())
         places = stack.enter_context(outputs.aside())
-        newton = engine == "newton"
         with progress("Driving in Newton" if newton else "Driving", "steps" if newton else "") as advance:
-            driven = drive(
-                scene,
-                what,
-                lab=lab,
-                map_layer=map_layer,
-                fit=fit,
-                scans=scans,
-                engine=engine,
-                progress=advance,
-                each=keep,
-                report=announce,
-                **options,
-            )
+            options |= {"progress": advance, "each": keep, "report": announce, "metadata": replayed}
+            driven = drive(scene, what, engine=engine, **options)
         announce("Writing the run")
         places.write(driven)
-    if live or viewer:
-        _show(driven, viewer, pace or 1.0)
-    return Done(driven.run.report(f"{what} in {scene}"), tuple(outputs.targets))
+    if live or settings.viewer:
+        _show(driven, settings.viewer, settings.pace or 1.0)
+    return driven
 
 
 def save_picture(driven: "Driven", out: Path, force: bool) -> None:
@@ -262,33 +253,25 @@ def save_picture(driven: "Driven", out: Path, force: bool) -> None:
 def _run_robots(
     scene: Path,
     outputs: "Outputs",
+    what: Any,
     *,
-    lab: str,
-    map_layer: Path | None,
     robot: str | None,
-    path: str | None,
-    fit: bool,
-    meet: Literal["refuse", "flag"] | None,
+    meet: Literal["refuse", "flag"],
     scans: bool,
+    fit: bool,
     **options: Any,
 ) -> Done:
     """Drive the robots of a scene of several, and write the run of each, or of the one that is named."""
-    from magtwin.io.formats import read_run
-    from magtwin.io.outputs import Driven
+    from magtwin.io.outputs import OPENING, Driven
     from magtwin.path import Path as Planned
     from magtwin.report.report import Report
-    from magtwin.sim.motion.commands import read_commands
     from magtwin.sim.motion.drive_input import drive_input
     from magtwin.twin import led_by, open_twin, room_of, scan, simulate_robots
 
-    commands, replay = options.pop("commands"), options.pop("replay")
-    opening = {
-        name: options.pop(name) for name in ("network", "magnetometer", "model_error", "tracking_error")
-    }
-    twin = open_twin(scene, lab=lab, map_layer=map_layer, **opening)
+    twin = open_twin(scene, **{name: options.pop(name) for name in OPENING})
     ways: dict[str, Any] = {spec.robot.name: spec.path or "figure8" for spec in twin.scene.robots}
-    if robot is not None and (commands or replay or path):
-        ways[robot] = read_commands(commands) if commands else read_run(replay) if replay else path
+    if robot is not None and what is not None:
+        ways[robot] = what
     ways = {
         name: drive_input(way, room_of(led_by(twin, name)), fit=fit and name == robot)
         for name, way in ways.items()
@@ -308,7 +291,7 @@ def _run_robots(
                 twin,
                 ways,
                 robots=names,
-                meet=meet or "refuse",
+                meet=meet,
                 progress=advance,
                 each=lambda name, block: kept[name](block),
                 **options,
@@ -344,12 +327,3 @@ def _show(driven: "Driven", address: str | None, pace: float) -> None:
                     check_listens(at)
         except InputError as error:  # no window can be opened, or the viewer was closed
             note(f"no view: {error}")
-
-
-def _what(path: str | None, commands: Path | None, replay: Path | None) -> str:
-    """What is driven, in a word; two of them are refused."""
-    given = {"--path": path, "--commands": commands, "--replay": replay}
-    named = [option for option, value in given.items() if value is not None]
-    if len(named) > 1:
-        raise InputError(f"{' and '.join(named)} each name what to drive; give one of them")
-    return path or str(commands or replay or "figure8")

@@ -30,12 +30,14 @@ from magtwin.io.rerun.viewer import check_decodes, show
 from magtwin.io.rerun.world import Interior, Robot, heading_of, send_room
 from magtwin.path import Path
 from magtwin.run import mapped
+from magtwin.run.arrow import without_pandas
 from magtwin.run.run import Run
 from magtwin.run.spool import blocks
 from magtwin.sim.sensors.lidar import Scans
 from magtwin.twin import Twin
 
 
+@without_pandas()
 def write_rrd(
     run: Run,
     path: str | os.PathLike[str],

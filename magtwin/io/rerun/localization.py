@@ -17,6 +17,7 @@ from magtwin.io.rerun.layout import value_range
 from magtwin.io.rerun.recording import ROOM, Recording, content_id, size_of, stream, title_of
 from magtwin.io.rerun.series import TIMELINE, Array, nanoseconds, send
 from magtwin.io.rerun.world import Scale, heading_of, send_map
+from magtwin.run.arrow import without_pandas
 from magtwin.run.run import Run
 
 FLOOR, PATHS = "floor", "floor/paths"
@@ -34,6 +35,7 @@ TRUTH, ESTIMATE, DEAD, BOUND, BAND = (
 PARTICLES = (230, 60, 110)
 
 
+@without_pandas()
 def write_localization(
     run: Run,
     path: str | os.PathLike[str],

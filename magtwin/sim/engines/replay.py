@@ -28,10 +28,7 @@ def replayed(run: Run, drive: DriveSpec) -> SampledMotion:
     if "yaw" not in run and "q_world_base_xyzw" not in run:
         lacking.append("yaw or q_world_base_xyzw")
     if lacking:
-        raise InputError(
-            f"a run to replay needs {', '.join(lacking)}, and has only {', '.join(run)}; a script of "
-            "t,v,w is for --commands"
-        )
+        raise InputError(f"a run to replay needs {', '.join(lacking)}, and has only {', '.join(run)}")
     if run.rows < 2:
         raise InputError(f"a run to replay needs at least two rows, got {run.rows}")
     t = run["t"]

@@ -106,6 +106,16 @@ def is_map_layer(path: str | os.PathLike[str]) -> bool:
     return len(prims_with(root, "anomalyMap")) == 1 and not prims_with(root, "robot")
 
 
+@translates
+def layer_of_map(path: str | os.PathLike[str]) -> Path | None:
+    """The file of a stage's layer with the values of its map; None if it has none or several maps."""
+    stage = open_stage(path)
+    maps = prims_with(stage.GetPseudoRoot(), "anomalyMap")
+    values = maps[0].GetAttribute(attribute_name("anomalyMap", "values")) if len(maps) == 1 else None
+    specs = values.GetPropertyStack() if values else []
+    return Path(specs[0].layer.realPath) if specs else None
+
+
 def check_map_layer(path: str | os.PathLike[str]) -> None:
     """Refuse a file that is no map layer, as `map_layer`; errors as for `is_map_layer`."""
     if not is_map_layer(path):

@@ -233,11 +233,11 @@ def test_run_drives_at_random_by_commands_and_by_replay(lab_scene, tmp_path, cap
     arguments = ["run", str(lab_scene), "--network", "none", "--json"]
     once, again = tmp_path / "a.parquet", tmp_path / "b.parquet"
     main([*arguments, "--path", "random", "--duration-s", "5", "--out", str(once)])
-    main([*arguments, "--replay", str(once), "--out", str(again)])
+    main([*arguments, "--path", str(once), "--out", str(again)])
     assert_array_equal(read_parquet(once)["p_world_base"], read_parquet(again)["p_world_base"])
     (tmp_path / "c.csv").write_text("t,v,w\n0,0.5,0\n0.4,0,0\n")
     capsys.readouterr()
-    main([*arguments[:-1], "--commands", str(tmp_path / "c.csv"), "--out", str(tmp_path / "c.parquet")])
+    main([*arguments[:-1], "--path", str(tmp_path / "c.csv"), "--out", str(tmp_path / "c.parquet")])
     assert "|v| above 0.306 m/s" in capsys.readouterr().err
     run = read_parquet(tmp_path / "c.parquet")
     assert 0.05 < run["p_world_base"][-1, 0] - run["p_world_base"][0, 0] < 0.2

@@ -219,12 +219,13 @@ def two(tmp_path_factory):
     return author_scene(replace(lab, robot=ann, path=folder / "ann.csv", others=others), folder / "scene")
 
 
-def test_run_writes_a_file_for_each_robot_and_robot_the_one_to_the_same_bits(two, tmp_path, capsys):
-    main(["run", str(two), "--out", str(tmp_path / "r.parquet"), "--rate-hz", "20", "--json"])
+def test_run_writes_a_file_for_each_robot_or_one_to_the_same_bits(two, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("MAGTWIN_RUN_RATE_HZ", "20")
+    main(["run", str(two), "--out", str(tmp_path / "r.parquet"), "--json"])
     report = json.loads(capsys.readouterr().out)
     assert {"ann: duration", "bob: duration"} <= report["figures"].keys()
     assert sorted(file.name for file in tmp_path.iterdir()) == ["r.ann.parquet", "r.bob.parquet"]
-    main(["run", str(two), "--robot", "bob", "--out", str(tmp_path / "one.parquet"), "--rate-hz", "20"])
+    main(["run", str(two), "--robot", "bob", "--out", str(tmp_path / "one.parquet")])
     whole, one = read_parquet(tmp_path / "r.bob.parquet"), read_parquet(tmp_path / "one.parquet")
     for name, values in whole.items():
         assert_array_equal(values, one[name], err_msg=name)

@@ -104,9 +104,12 @@ def test_a_plant_given_as_a_spec_is_in_the_metadata_and_the_run_comes_out_again(
         repeat(damaged)
 
 
-def test_the_commands_take_a_plant_and_reproduce_takes_it_from_the_run(lab_scene, twin, tmp_path, capsys):
+def test_commands_take_a_plant_and_reproduce_takes_it_from_the_run(
+    lab_scene, twin, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setenv("MAGTWIN_RUN_RATE_HZ", "20")
     out = tmp_path / "run.parquet"
-    options = ["--plant", "nonlinear:2", "--magnetometer", "physical", "--duration-s", "2", "--rate-hz", "20"]
+    options = ["--plant", "nonlinear:2", "--magnetometer", "physical", "--duration-s", "2"]
     main(["run", str(lab_scene), "--out", str(out), "--path", "figure8", *options])
     run = read_parquet(out)
     own = simulate(twin, "figure8", plant="nonlinear:2", duration_s=2.0, rate_hz=20.0)
