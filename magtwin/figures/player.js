@@ -17,7 +17,7 @@ async function main() {
   const data = await unpack(document.getElementById("player-data").textContent);
   const clock = new Clock(data.arrays.t);
   const views = [charts(data, clock), bar(data, clock), words(data, clock), table(data)];
-  if (data.scene || data.map) {
+  if (data.arrays.x) {
     try {
       views.push(await stage(data, clock));
       root.dataset.state = "live";
@@ -25,8 +25,11 @@ async function main() {
       at("note").textContent = `The lab is not drawn: ${error.message}`;
     }
   }
-  const told = /[#&]t=([\d.]+)/;
-  const seek = () => { const found = told.exec(location.hash); if (found) clock.seek(Number(found[1])); };
+  const seek = () => { // #t=30&view=top
+    const told = new URLSearchParams(location.hash.slice(1));
+    for (const button of at("views").children) if (button.value === told.get("view")) button.click();
+    if (told.get("t")) clock.seek(Number(told.get("t")) || 0);
+  };
   addEventListener("hashchange", seek);
   seek();
   clock.tell();

@@ -33,7 +33,7 @@ Array = NDArray[Any]
 Integers = NDArray[np.int32]
 
 MOST_ROWS = 8_000
-"""Most readings of a page. A longer run is cut into stretches: the page has the first reading of each, and that
+"""Most readings of a page. A longer run is cut into stretches: the page has the first reading and that
 with the largest step."""
 
 MOST_TRIANGLES = 60_000
@@ -54,7 +54,7 @@ CHARTS: tuple[dict[str, Any], ...] = (
     {"title": "Error", "unit": "nT", "scale": 1, "digits": 0, "lines": ("error",), "band": "band"},
     {"title": "Position error", "unit": "m", "scale": 0.001, "digits": 3, "lines": ("off", "off_band")},
 )
-"""Charts by their columns. `scale` times an integer is in `unit`; `band` is half the width of a band about 0."""
+"""Charts by their columns. `scale` times an integer is in `unit`; `band` is half the width of a band at 0."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def player_of(
         notes += [f"{left_out:,} small shapes of the scene are left out."] if left_out else []
     place = f"The lab with the robot{'s' * bool(others)} and the driven path" if stage else "The driven path"
     alt = f"{place} on the map of the field." if field else f"{place}."
-    shown = "lab" if (stage or field) and "x" in arrays else "none"
+    shown = "lab" if "x" in arrays else "none"
     return Player(packed(head, arrays), figures_of(run), alt, still, shown, " ".join(notes))
 
 
@@ -144,7 +144,7 @@ def rows_shown(run: Run) -> NDArray[np.intp]:
     if run.rows <= MOST_ROWS:
         return np.arange(run.rows)
     name = next((name for name in ("b_measured_nt", "b_total_nt", "t") if name in run), "t")
-    step = np.abs(np.diff(np.nan_to_num(run[name]), n=2, append=[0, 0]))
+    step = np.abs(np.convolve(np.nan_to_num(run[name]), [-0.5, 1, -0.5], "same"))
     edges = np.linspace(0, run.rows, MOST_ROWS // 2 + 1).astype(int)
     worst = [a + int(np.argmax(step[a:b])) for a, b in pairwise(edges)]
     return np.unique([*edges[:-1], *worst, run.rows - 1])
