@@ -196,8 +196,8 @@ def columns_of(run: Run, rows: Any) -> tuple[dict[str, Array], dict[str, str]]:
     if field is not None and judge is not None and reading is not None:
         add("trail", reading - field)
         add("own", judge - field)
-        if "b_total_nt" in run and np.any(get("b_disturbance_nt")):
-            predicted = prediction_nt(run)[rows]
+        predicted = prediction_nt(run)[rows] if "b_total_nt" in run else judge
+        if np.any(np.nan_to_num(predicted - field)) and np.any(np.nan_to_num(predicted - judge)):
             add("predicted", predicted - field)
             add("error", predicted - judge)
             add("band", None if sd is None else Z_90 * sd)
