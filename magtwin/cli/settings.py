@@ -34,7 +34,7 @@ class RunSettings(SensorSettings):
     """Settings of `magtwin run`."""
 
     rate_hz: float | None = None
-    controller: Literal["follower", "release", "stanley", "pure_pursuit"] = "follower"
+    controller: Literal["follower", "release"] = "follower"
     meet: Literal["refuse", "flag"] | None = None
     out_unit: Literal["T", "nT"] | None = None
     usd_fps: float | None = None

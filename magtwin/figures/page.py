@@ -19,6 +19,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from magtwin.errors import InputError
 from magtwin.figures.canvas import Picture
+from magtwin.figures.player import Player
 from magtwin.files.outputs import output
 from magtwin.report.summary import printable, printable_lines
 from magtwin.version import __version__
@@ -93,6 +94,9 @@ class Page:
 
     data: Mapping[str, Any] = field(default_factory=dict)
     """Content of the JSON form."""
+
+    player: Player | None = None
+    """What plays the run in its lab, above the sections; only HTML has it."""
 
 
 def write_page(page: Page, path: str | os.PathLike[str], *, force: bool = False) -> None:

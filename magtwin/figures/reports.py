@@ -1,7 +1,8 @@
 """Reports: one run or several as a page; two runs compared; and one path driven twice."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,8 @@ from magtwin.figures.canvas import (
     short_pair,
 )
 from magtwin.figures.page import Page, Section, Table
-from magtwin.figures.runs import field_name, pictures_of_run, position_name
+from magtwin.figures.player import Player, player_of
+from magtwin.figures.runs import field_name, path_picture, position_name
 from magtwin.run.compare import ERRORS, Agreement, Comparison, Traversals, errors_of, terms_of
 from magtwin.run.figures import prediction_nt
 from magtwin.run.run import COLUMNS, Metadata, Run
@@ -62,6 +64,9 @@ class NamedRun:
     note: str = ""
     """A remark for the reader, such as why its map is not shown."""
 
+    stage: Path | None = None
+    """Its scene, or None."""
+
 
 def page_of_runs(
     runs: Sequence[NamedRun], *, pictures: bool = True, advance: Callable[[int], None] = lambda done: None
@@ -83,10 +88,12 @@ def page_of_runs(
             raise InputError(f"{named.name}: has no readings to report on")
     sections = []
     for k, named in enumerate(runs):
-        sections.append(_section(named, pictures))
+        sections.append(_section(named, pictures and len(runs) > 1))
         advance(k + 1)
     if len(runs) == 1:
-        return Page(_title(runs[0]), _sentence(runs[0].run), (sections[0],))
+        lead = runs[0].run.report().verdict or _sentence(runs[0].run)
+        player = _player(runs[0]) if pictures else None
+        return Page(_title(runs[0]), lead, (sections[0],), player=player)
     head = ("run", "path", "seed", "readings", "duration [s]", "distance [m]", "MAE [nT]", "RMS [nT]")
     note = "MAE and RMS: error of b_measured_nt against the exact field, where that is known."
     overview = Table("Overview", (*head, "events"), tuple(map(_overview, runs)), note)
@@ -138,8 +145,20 @@ def _section(named: NamedRun, pictures: bool) -> Section:
     tables.append(Table("Events", head, events, "" if events else "None."))
     rows = tuple(run.metadata.items())
     tables.append(Table("Provenance", ("metadata", ""), rows, "" if rows else "No metadata.", exact=True))
-    drawn = pictures_of_run(run, named.field, named.planned) if pictures else []
-    return Section(_title(named), f"{named.name}. {named.note}".strip(), tuple(drawn), tuple(tables))
+    drawn = path_picture(run, named.field, named.planned) if pictures else None
+    lead = f"{named.name}: {_sentence(run)} {named.note}".strip()
+    return Section(_title(named), lead, () if drawn is None else (drawn,), tuple(tables))
+
+
+def _player(named: NamedRun) -> Player:
+    """What plays a run; its charts and map alone if its scene cannot be shown, and why."""
+    still = path_picture(named.run, named.field, named.planned)
+    options: Any = {"still": b"" if still is None else still.data}
+    try:
+        return player_of(named.run, named.field, named.stage, **options)
+    except InputError as error:
+        player = player_of(named.run, named.field, None, **options)
+        return replace(player, note=f"The scene is not shown: {error}. {player.note}".strip())
 
 
 def _overview(named: NamedRun) -> tuple[Any, ...]:

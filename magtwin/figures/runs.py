@@ -1,4 +1,4 @@
-"""Runs: the path over the map and the readings against time, as one figure or as pictures for a page."""
+"""Runs: the path over the map and the readings against time, as one figure; or the path alone, for a page."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -28,7 +28,6 @@ from magtwin.figures.canvas import (
     label,
     legend_above,
     new_figure,
-    open_frame,
     picture,
     shade,
 )
@@ -88,28 +87,6 @@ def draw_run(run: Run, field: AnomalyMap | None = None, planned: ArrayLike | Non
     elif place is None:
         raise InputError("the run has neither positions nor columns of numbers to draw")
     return figure
-
-
-def pictures_of_run(
-    run: Run, field: AnomalyMap | None = None, planned: ArrayLike | None = None
-) -> list[Picture]:
-    """Pictures of a run for a page: its path, and one for each of its quantities against time.
-
-    Args:
-        run: The run. Columns that it lacks are left out.
-        field: The map below the path. None draws a bare floor.
-        planned: The planned path in world [m], shape (M, 2).
-    """
-    path = _path_picture(run, field, planned)
-    pictures = [] if path is None else [path]
-    for panel in panels_of(run):
-        figure = new_figure(WIDTH_IN, 2.5)
-        ax = figure.subplots()
-        panel.draw(ax, run)
-        label(ax, "time [s]")
-        open_frame(ax)
-        pictures.append(picture(figure, panel.title, alt=f"{panel.title} against time"))
-    return pictures
 
 
 @dataclass(frozen=True)
@@ -250,7 +227,14 @@ def _has(run: Run, *names: str) -> bool:
     return all(name in run and np.isfinite(run[name]).any() for name in names)
 
 
-def _path_picture(run: Run, field: AnomalyMap | None, planned: ArrayLike | None) -> Picture | None:
+def path_picture(run: Run, field: AnomalyMap | None, planned: ArrayLike | None) -> Picture | None:
+    """The path of a run over its map, or over a bare floor; None if its places or readings are unknown.
+
+    Args:
+        run: The run.
+        field: The map below the path, or None.
+        planned: The planned path in world [m], shape (M, 2), or None.
+    """
     position, column = position_name(run), field_name(run)
     if position is None or column is None:
         return None

@@ -147,6 +147,7 @@ def report_runs(
         InputError: A run or `scene` cannot be read, or the page cannot be written.
     """
     from magtwin.files.kinds import scene_file
+    from magtwin.twin import scene_of
 
     out = check_free(out, force=force)
     scene = None if scene is None else scene_file(scene)
@@ -155,15 +156,15 @@ def report_runs(
     named = []
     for k, file in enumerate(files):
         progress(k, len(files), f"reading {file.name}")
-        run, note, field = read_run(file), "", None
+        run, note, field, stage = read_run(file), "", None, None
         try:
-            field = map_of(run, scene, near=file)
+            field, stage = map_of(run, scene, near=file), scene_of(run, scene, near=file)
         except InputError as error:
             note = f"Its map is not shown: {error}."
             if scene is not None:
                 warnings.warn(f"{file}: its map is not shown: {error}", MismatchWarning, stacklevel=2)
         name = file.name if names.count(file.name) == 1 else str(file)
-        named.append(NamedRun(name, run, field, planned_of(run, near=file), note))
+        named.append(NamedRun(name, run, field, planned_of(run, near=file), note, stage))
     pictured = len(named) <= MOST_PICTURED
     page = page_of_runs(named, pictures=pictured, advance=lambda done: progress(done, len(named), "drawing"))
     if not pictured:
