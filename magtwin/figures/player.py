@@ -251,7 +251,7 @@ def floor_of(field: AnomalyMap) -> tuple[dict[str, Any], Integers, Integers]:
     }
     size = {"dx": float(field.cell_m[0]), "dy": float(field.cell_m[1]), "waves": len(parts)}
     colours = {"low": round(low), "high": max(round(high), round(low) + 1), "rms": round(rms)}
-    return place | size | colours, integers(parts, 1), known.astype(np.int32)
+    return place | size | colours, integers(parts, 1), np.asarray(known, np.int32)
 
 
 def scene_of(arrays: dict[str, Array], stage: Path, runs: Sequence[Run]) -> tuple[dict[str, Any], int]:
