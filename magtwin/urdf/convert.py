@@ -183,7 +183,7 @@ class _Author:
         notes = Vt.StringArray(description.repairs.notes)
         stage.GetRootLayer().customLayerData = {
             **stage.GetRootLayer().customLayerData,
-            **metadata(stage, report, options.metadata),
+            **metadata(stage, description, report, options.metadata),
             "magtwin": {
                 "source": description.path.name,
                 "sourceSha256": checksum,

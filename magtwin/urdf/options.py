@@ -103,7 +103,7 @@ class Options:
     is called."""
 
     metadata: Mapping[str, str] = field(default_factory=dict)
-    """Metadata of the asset: author, asset_license, category and others."""
+    """Metadata of the asset (author, asset_license, category, ...); overrides that of its package."""
 
 
 DEFAULTS = Options()
