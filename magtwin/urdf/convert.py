@@ -90,7 +90,7 @@ def convert_with_report(
             `.thumbs/256x256/`, where asset browsers look for it.
 
     Returns:
-        Every link, joint and geometry before and after, and all notes.
+        Every link and joint before and after, and all notes.
 
     Raises:
         InputError: The URDF cannot be converted, `options.strict` is set and something was repaired or
