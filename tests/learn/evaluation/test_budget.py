@@ -130,11 +130,6 @@ def test_a_run_of_another_scene_is_refused(drives, truth, found, train):
         budget(other, 0, truth, train)
 
 
-def test_a_run_of_no_known_session_is_refused(twin):
-    with pytest.raises(InputError, match="name no valid session"):
-        in_session_of(twin, {"session_seed": 1, "session": "monday"})
-
-
 def test_a_run_without_the_truth_is_refused(drives, truth, found, train):
     bare = Run({k: v for k, v in drives["d2"].items() if k != "b_truth_nt"}, drives["d2"].metadata)
     other = replace(found, judged=(replace(found.judged[0], name="d8", run=bare),))
