@@ -36,7 +36,7 @@ class Robot:
     """Parameters for the simulator; None without settings."""
 
     report: ConversionReport
-    """Every link, joint and geometry before and after."""
+    """Every link and joint before and after."""
 
 
 def from_urdf(

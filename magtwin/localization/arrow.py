@@ -1,78 +1,69 @@
 """Arrow: linear systems whose matrix is block tridiagonal with a dense border.
 
-    [ A   B ] [ x ]   [ a ]
-    [ B'  C ] [ g ] = [ c ]
+    [ T   C ] [ x ]   [ a ]
+    [ C'  G ] [ g ] = [ c ]
 
-A has one block for each pose, coupled to the next one; g are the constants of the run. Eliminating the poses
-with A = L L', Y = L^-1 B gives (C - Y'Y) g = c - Y' L^-1 a, and x from L' x = L^-1 a - Y g. The work grows
-with the number of poses N and as the square of the number of constants.
+T has one block for each pose, coupled to the next one; g are the constants of the run. With the banded
+Cholesky factor T = L L' and Y = L^-1 C, (G - Y'Y) g = c - Y' L^-1 a, and x from L' x = L^-1 a - Y g. The work
+grows with the number of poses N and as the square of the number of constants.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, cholesky
-from scipy.linalg.blas import dsyrk
-
-from magtwin.compiled import Loops
+from scipy.linalg import cho_factor, cho_solve, cholesky_banded
+from scipy.linalg.lapack import dtbtrs
 
 Array = NDArray[np.float64]
 
 
-def gram(flat: Array) -> Array:
-    """Square, flat' flat, of a contiguous array, by half the products."""
-    upper = dsyrk(1.0, flat.T)
-    return np.asarray(np.triu(upper) + np.triu(upper, 1).T)
-
-
-LOOPS = Loops("magtwin.localization.arrow_loops", pays=0)
-"""Compiled loops; plain Python would take seconds for each system."""
-
-
 @dataclass(frozen=True, eq=False)
 class Arrow:
-    """A symmetric positive definite system, to be solved once."""
+    """A symmetric positive definite system."""
 
     diagonal: Array
-    """Diagonal blocks of A, shape (N, D, D)."""
+    """Diagonal blocks of T, shape (N, D, D)."""
 
     below: Array
-    """Blocks of A below them, shape (N - 1, D, D)."""
+    """Blocks of T below them, shape (N - 1, D, D)."""
 
     border: Array
-    """B and in its last column a, shape (N, D, G + 1)."""
+    """C and in its last column a, shape (N, D, M + 1)."""
 
     corner: Array
-    """C, shape (G, G)."""
+    """G, shape (M, M)."""
 
     right: Array
-    """c, shape (G,)."""
+    """c, shape (M,)."""
 
     def damped(self, factor: float) -> "Arrow":
         """A copy with the diagonal of the matrix grown by a factor (Marquardt 1963)."""
         diagonal, corner = self.diagonal.copy(), self.corner.copy()
         diagonal[:, range(diagonal.shape[1]), range(diagonal.shape[1])] *= 1 + factor
         corner[range(len(corner)), range(len(corner))] *= 1 + factor
-        return Arrow(diagonal, self.below.copy(), self.border.copy(), corner, self.right)
+        return Arrow(diagonal, self.below, self.border, corner, self.right)
 
     def solve(self) -> "Solution":
-        """Solve the system. It overwrites the blocks.
+        """Solve the system.
 
         Raises:
             np.linalg.LinAlgError: The matrix is not positive definite.
         """
-        code = LOOPS.open()
-        if code.eliminate(self.diagonal, self.below, self.border) >= 0:
-            raise np.linalg.LinAlgError("the block of a pose is not positive definite")
-        flat = self.border.reshape(-1, self.border.shape[2])
-        square = gram(flat)
-        factor = cholesky(self.corner - square[:-1, :-1], lower=True, check_finite=False)
-        g = cho_solve((factor, True), self.right - square[:-1, -1], check_finite=False)
-        x = (self.border[:, :, -1] - self.border[:, :, :-1] @ g)[..., None]
-        x = np.ascontiguousarray(x)
-        code.substitute(self.diagonal, self.below, x)
-        return Solution(x[..., 0], g, self.diagonal, self.below, self.border[:, :, :-1], factor)
+        n, b, wide = self.border.shape
+        band = np.zeros((2 * b, n * b))  # T in the lower banded form of LAPACK
+        for i in range(b):
+            for j in range(b):
+                if i >= j:
+                    band[i - j, j::b] = self.diagonal[:, i, j]
+                band[b + i - j, j : (n - 1) * b : b] = self.below[:, i, j]
+        factor = cholesky_banded(band, lower=True, check_finite=False)
+        y = dtbtrs(factor, np.asfortranarray(self.border.reshape(n * b, wide)), uplo="L")[0]
+        square = y.T @ y
+        schur = cho_factor(self.corner - square[:-1, :-1], check_finite=False)
+        g = cho_solve(schur, self.right - square[:-1, -1], check_finite=False)
+        x = dtbtrs(factor, y[:, -1] - y[:, :-1] @ g, uplo="L", trans="T")[0]
+        return Solution(x.reshape(n, b), g, self, factor, y[:, :-1], schur)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,42 +74,54 @@ class Solution:
     """Poses' part, shape (N, D)."""
 
     g: Array
-    """Constants' part, shape (G,)."""
+    """Constants' part, shape (M,)."""
 
-    diagonal: Array
-    """Diagonal blocks of L with inverted diagonal entries, shape (N, D, D)."""
-
-    below: Array
-    """Blocks of L below them, shape (N - 1, D, D)."""
-
-    border: Array
-    """Y, shape (N, D, G)."""
+    arrow: Arrow
+    """The system."""
 
     factor: Array
-    """Cholesky factor of C - Y'Y, lower, shape (G, G)."""
+    """L in the lower banded form of LAPACK."""
+
+    y: Array
+    """Y, shape (N D, M)."""
+
+    schur: tuple[Array, bool]
+    """Factor of G - Y'Y."""
 
     def pose_covariances(self) -> Array:
-        """Diagonal blocks of the poses' part of the inverse, shape (N, D, D)."""
-        code = LOOPS.open()
-        out = np.empty(self.diagonal.shape)
-        code.covariances(self.diagonal, self.below, out)
-        v = np.ascontiguousarray(self.border)
-        code.substitute(self.diagonal, self.below, v)
-        count, size, wide = v.shape
-        half = np.linalg.inv(self.factor) @ v.reshape(-1, wide).T
-        half = half.T.reshape(count, size, wide)
-        return np.asarray(out + half @ half.transpose(0, 2, 1))
+        """Diagonal blocks of the poses' part of the inverse, shape (N, D, D).
+
+        Forward, the Schur complements S_k = D_k - L_k-1 S_k-1^-1 L_k-1'. Backward, the selected inverse of T,
+        P_k = S_k^-1 + S_k^-1 L_k' P_k+1 L_k S_k^-1 (Takahashi, Fagan and Chen 1973).
+        """
+        diagonal, below = self.arrow.diagonal, self.arrow.below
+        inverses = self._schur_inverses()
+        made = inverses.copy()
+        for k in range(len(diagonal) - 2, -1, -1):
+            gain = inverses[k] @ below[k].T
+            made[k] += gain @ made[k + 1] @ gain.T
+        w = dtbtrs(self.factor, self.y, uplo="L", trans="T")[0].reshape(*diagonal.shape[:2], -1)
+        made += w @ self._constants() @ w.transpose(0, 2, 1)
+        return np.asarray(0.5 * (made + made.transpose(0, 2, 1)))
 
     def last_covariance(self) -> Array:
-        """Joint covariance of the last pose and the constants, shape (D + G, D + G)."""
-        lower = np.tril(self.diagonal[-1], -1) + np.diag(1 / np.diagonal(self.diagonal[-1]))
-        root = np.linalg.inv(lower)
-        v = root.T @ self.border[-1]
-        size, wide = v.shape
-        out = np.empty((size + wide, size + wide))
-        inverse = np.linalg.inv(self.factor)
-        out[size:, size:] = constants = inverse.T @ inverse
-        out[:size, size:] = -v @ constants
-        out[size:, :size] = out[:size, size:].T
-        out[:size, :size] = root.T @ root + v @ constants @ v.T
-        return out
+        """Joint covariance of the last pose and the constants, shape (D + M, D + M)."""
+        size, corner = self.x.shape[1], self._constants()
+        last = np.zeros((2 * size, size))
+        last[:size] = self.factor[:size, -size:]  # of the last block alone
+        w = dtbtrs(last, self.y[-size:], uplo="L", trans="T")[0]
+        across = -w @ corner
+        pose = self._schur_inverses()[-1] - across @ w.T
+        made = np.block([[pose, across], [across.T, corner]])
+        return np.asarray(0.5 * (made + made.T))
+
+    def _constants(self) -> Array:
+        return np.asarray(cho_solve(self.schur, np.eye(len(self.g)), check_finite=False))
+
+    def _schur_inverses(self) -> Array:
+        diagonal, below = self.arrow.diagonal, self.arrow.below
+        made = np.empty_like(diagonal)
+        made[0] = np.linalg.inv(diagonal[0])
+        for k in range(1, len(diagonal)):
+            made[k] = np.linalg.inv(diagonal[k] - below[k - 1] @ made[k - 1] @ below[k - 1].T)
+        return made

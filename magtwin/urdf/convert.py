@@ -90,7 +90,7 @@ def convert_with_report(
             `.thumbs/256x256/`, where asset browsers look for it.
 
     Returns:
-        Every link, joint and geometry before and after, and all notes.
+        Every link and joint before and after, and all notes.
 
     Raises:
         InputError: The URDF cannot be converted, `options.strict` is set and something was repaired or
@@ -183,7 +183,7 @@ class _Author:
         notes = Vt.StringArray(description.repairs.notes)
         stage.GetRootLayer().customLayerData = {
             **stage.GetRootLayer().customLayerData,
-            **metadata(stage, report, options.metadata),
+            **metadata(stage, description, report, options.metadata),
             "magtwin": {
                 "source": description.path.name,
                 "sourceSha256": checksum,

@@ -40,7 +40,7 @@ class DriveRule:
                 raise InputError(f"drive {self.joints!r}: type {self.type} has no {name}, got {figure:g}")
         if used and not getattr(self, used[0]):
             raise InputError(
-                f"drive {self.joints!r}: without {used[0]} it cannot hold a {self.type}; give it"
+                f"drive {self.joints!r}: without {used[0]} it cannot hold a {self.type}; give {used[0]}="
             )
         if self.max_force is not None and not 0 < self.max_force < math.inf:
             raise InputError(f"drive {self.joints!r}: max_force must be above 0, got {self.max_force!r}")
@@ -103,7 +103,7 @@ class Options:
     is called."""
 
     metadata: Mapping[str, str] = field(default_factory=dict)
-    """Metadata of the asset: author, asset_license, category and others."""
+    """Metadata of the asset (author, asset_license, category, ...); overrides that of its package."""
 
 
 DEFAULTS = Options()

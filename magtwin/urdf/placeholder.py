@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Geometry, Link, Shape
-from magtwin.urdf.meshes.mesh import bounds
 from magtwin.urdf.meshes.mesh_layer import MeshLayer
 from magtwin.urdf.source.package import MissingFileError
 
@@ -71,7 +70,7 @@ def _box_of(link: Link, meshes: MeshLayer) -> tuple[NDArray[np.float64], NDArray
     known = [points for points in corners if points is not None]
     size, T = np.full(3, EDGE_M), np.eye(4)
     if known:
-        low, high = bounds(np.vstack(known))
+        low, high = np.min(known, (0, 1)), np.max(known, (0, 1))
         size, T[:3, 3] = high - low, (low + high) / 2
     return np.maximum(np.round(size, 6), THINNEST_M), T
 
@@ -82,7 +81,8 @@ def _corners(shape: Shape, meshes: MeshLayer) -> NDArray[np.float64] | None:
     if form.kind == "mesh":
         if form.filename in meshes.failed:
             return None
-        low, high = bounds(meshes.vertices(form))
+        points = meshes.vertices(form)
+        low, high = points.min(0), points.max(0)
     else:
         half = form.half_extents(np.eye(3))
         low, high = -half, half

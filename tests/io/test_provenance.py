@@ -44,7 +44,6 @@ def test_a_run_names_its_files_with_checksums(run, lab_scene, twin):
     assert "path_file" not in metadata
 
 
-@pytest.mark.usefixtures("allow_neighbours")
 def _chain(folder):
     """A stage that references a layer that references another, and names a file."""
     folder.mkdir(parents=True)
@@ -60,6 +59,7 @@ def _chain(folder):
     (folder / "weights.bin").write_bytes(b"weights")
 
 
+@pytest.mark.usefixtures("allow_neighbours")
 def test_the_stages_checksum_follows_content_in_any_layer_and_not_the_place(lab_scene, tmp_path):
     for name in ("a", "b/deeper"):
         _chain(tmp_path / name)

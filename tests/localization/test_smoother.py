@@ -102,7 +102,7 @@ def test_in_a_linear_field_it_agrees_with_the_rts_smoother():
 
 def test_it_is_consistent_and_better_than_its_forward_pass():
     smoothed, filtered, nees = [], [], []
-    for seed in range(8):
+    for seed in range(5):
         case = synthetic.drive(synthetic.wavy_map(seed), seed)
         _, score = synthetic.scored(MapSmoother(), case)
         smoothed.append(score.error)
@@ -110,7 +110,7 @@ def test_it_is_consistent_and_better_than_its_forward_pass():
         filtered.append(synthetic.scored(PointMass(), case)[1].error)
     rmse, forward = (math.sqrt(np.mean(np.square(v))) for v in (smoothed, filtered))
     assert rmse < 0.7 * forward
-    assert 0.6 < np.mean(nees) < 1.5  # sd of the mean over 8 correlated drives is about 0.2
+    assert 0.6 < np.mean(nees) < 1.5  # sd of the mean over 5 correlated drives is about 0.25
 
 
 def test_a_global_start_is_smoothed_back_to_the_first_reading():

@@ -233,12 +233,14 @@ def test_a_conversion_that_fails_leaves_nothing(tmp_path):
     assert not list((tmp_path / "made").iterdir())
 
 
-def test_metadata_are_those_that_are_given(tmp_path):
+def test_metadata_come_from_the_package_unless_they_are_given(tmp_path):
+    text = "<package><name>arms</name><author>A. Maker</author><license>BSD-3-Clause</license></package>"
+    (tmp_path / "package.xml").write_text(text)
     choices = Options(metadata={"category": "toy", "asset_license": "MIT"})
     out = convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda", options=choices)
     said = Sdf.Layer.FindOrOpen(str(out)).customLayerData["SimReady_Metadata"]
     names = ("author", "asset_license", "category", "asset_name", "rigid_body_count", "mass")
-    assert [said[name] for name in names] == ["not stated", "MIT", "toy", "arm", 2, 2]
+    assert [said[name] for name in names] == ["A. Maker", "MIT", "toy", "arm", 2, 2]
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.localization.arrow import Arrow, Solution, gram
+from magtwin.localization.arrow import Arrow, Solution
 from magtwin.localization.slam.model import Model, State, cross
 from magtwin.localization.slam.samples import Samples
 
@@ -123,7 +123,7 @@ class Batch:
         np.matmul(ht, hg, out=border[:, :, :-1])
         border[:, :, -1] = (ht @ r.readings[..., None])[..., 0]
         flat = hg.reshape(-1, constants)
-        corner = gram(flat)
+        corner = flat.T @ flat
         right = flat.T @ r.readings.ravel()
         corner[range(constants), range(constants)] += self._root_constants**2
         right -= self._root_constants * r.constants

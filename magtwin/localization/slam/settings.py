@@ -46,25 +46,18 @@ class Settings:
     """Random walk of odometry's roll and pitch [rad/sqrt(s)], for three axes."""
 
     def __post_init__(self) -> None:
-        for name in ("length_m", "sd_nt", "uniform_sd_nt", "vertical_std_s", "tilt_std_s"):
-            _refuse(name, getattr(self, name), 0.0, above=True)
-        for name in ("velocity_sd_m_s", "soft_iron_sd"):
-            _refuse(name, getattr(self, name), 0.0)
+        above = ("length_m", "sd_nt", "uniform_sd_nt", "vertical_std_s", "tilt_std_s")
+        for name in (*above, "velocity_sd_m_s", "soft_iron_sd"):
+            value = getattr(self, name)
+            if not (
+                isinstance(value, int | float) and 0 <= value < math.inf and (value or name not in above)
+            ):
+                word = "above" if name in above else "at least"
+                text = f"{name} must be a finite number {word} 0, got {value!r}"
+                raise InputError(text, parameter=name)
         if isinstance(self.functions, bool) or self.functions != int(self.functions) or self.functions < 1:
-            raise InputError(
-                f"functions must be a whole number from 1, got {self.functions}", parameter="functions"
-            )
+            text = f"functions must be a whole number from 1, got {self.functions}"
+            raise InputError(text, parameter="functions")
         if self.odometry_axes not in ("body", "world"):
             text = f"odometry_axes must be body or world, got {self.odometry_axes!r}"
             raise InputError(text, parameter="odometry_axes")
-
-
-def _refuse(name: str, value: float, least: float, *, above: bool = False) -> None:
-    """Raise `InputError` unless an option is a finite number from (or above) the least one."""
-    try:
-        good = math.isfinite(value) and (value > least if above else value >= least)
-    except TypeError:
-        good = False
-    if not good:
-        word = "above" if above else "at least"
-        raise InputError(f"{name} must be a finite number {word} {least:g}, got {value!r}", parameter=name)

@@ -43,14 +43,6 @@ class Geometry:
             return self.kind == "box" and 0 in self.size
         return self.radius == 0 or (self.kind == "cylinder" and self.length == 0)
 
-    @property
-    def volume(self) -> float:
-        """Volume of a primitive [m3]."""
-        if self.kind == "box":
-            return float(np.prod(self.size))
-        ball = 0.0 if self.kind == "cylinder" else 4 / 3 * np.pi * self.radius**3
-        return ball + np.pi * self.radius**2 * self.length
-
     def half_extents(self, R: Array) -> Array:
         """Half the edges of the axis-aligned box around a primitive at the origin [m], shape (3,).
 

@@ -212,12 +212,6 @@ def has_area(points: NDArray, faces: NDArray) -> NDArray[np.bool_]:
     return nx**2 + ny**2 + nz**2 > (1e-9 * np.maximum(uu, np.maximum(vv, ww))) ** 2
 
 
-def bounds(points: NDArray) -> tuple[NDArray, NDArray]:
-    """Lower and upper corner of the box around points (N, 3); column by column, which is faster."""
-    columns = np.ascontiguousarray(points.T)
-    return columns.min(1), columns.max(1)
-
-
 def distinct(rows: NDArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The distinct rows of an array of floats, in the order of first occurrence.
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.files.budget import check_size
 from magtwin.urdf.meshes.piece import Piece
-from magtwin.urdf.meshes.reading import Reading
+from magtwin.urdf.meshes.reading import Reading, numbers
 
 STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 """A triangle of a binary STL, after 80 bytes of text and the number of triangles."""
@@ -45,4 +45,6 @@ def _corners(data: bytes, reading: Reading) -> NDArray[np.float64]:
         return np.empty((0, 3))
     check_size(reading.path, "OBJ")
     reading.spend(WORD * data.lower().count(b"vertex") + 3 * len(data))
-    return np.array([row.split() for row in VERTEX.findall(data)], float).reshape(-1, 3)
+    rows = VERTEX.findall(data)
+    values = numbers(b" ".join(rows).decode("ascii", errors="replace"), float)
+    return values.reshape(-1, 3) if len(values) == 3 * len(rows) else np.empty((0, 3))

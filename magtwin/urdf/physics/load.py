@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Inertial
+from magtwin.urdf.physics.inertia import MassProperties, combined
 
 GRAVITY = 9.80665
 """Standard gravity [m/s2]; CODATA 2018."""
@@ -42,27 +43,28 @@ def read_loads(description: Description, poses: Mapping[str, NDArray]) -> dict[s
         description: Links and joints.
         poses: T_root_link of each link, parents before children, shape (4, 4) each.
     """
-    moments = {
-        name: _moments(description.links[name].inertial, T) for name, T in poses.items()
+    whole = {
+        name: _body(inertial, T)
+        for name, T in poses.items()
+        if (inertial := description.links[name].inertial) is not None and inertial.mass
     }  # of each link and, below, of all links beyond it
     for child in reversed(list(poses)):
-        if child in description.joints:
+        if child in description.joints and child in whole:
             parent = description.joints[child].parent
-            moments[parent] = moments[parent] + moments[child]
+            whole[parent] = combined([whole[name] for name in (parent, child) if name in whole])
     loads = {}
     for child, joint in description.joints.items():
-        mass, first, second = moments[child][0, 0], moments[child][1:4, 0], moments[child][1:4, 1:4]
-        length = float(np.linalg.norm(joint.axis))
-        if not mass or not length:
+        body, length = whole.get(child), float(np.linalg.norm(joint.axis))
+        if body is None or not length:
             loads[joint.name] = Load(0.0, 0.0)
             continue
+        mass = body.mass
         if joint.type == "prismatic":
-            loads[joint.name] = Load(float(mass), float(mass * GRAVITY))
+            loads[joint.name] = Load(mass, mass * GRAVITY)
             continue
-        axis, centre = poses[child][:3, :3] @ np.asarray(joint.axis, float) / length, first / mass
-        own = second - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-        arm = float(np.linalg.norm(np.cross(axis, centre - poses[child][:3, 3])))
-        about = float(axis @ own @ axis) + mass * arm**2
+        axis = poses[child][:3, :3] @ np.asarray(joint.axis, float) / length
+        arm = float(np.linalg.norm(np.cross(axis, body.centre - poses[child][:3, 3])))
+        about = float(axis @ body.inertia @ axis) + mass * arm**2
         beside = mass * arm**2 / about if about > 0 else 0.0
         loads[joint.name] = Load(
             max(about, 0.0), float(mass * GRAVITY * arm), float(beside), float(abs(axis[2]))
@@ -70,19 +72,7 @@ def read_loads(description: Description, poses: Mapping[str, NDArray]) -> dict[s
     return loads
 
 
-def _moments(inertial: Inertial | None, T: NDArray) -> NDArray[np.float64]:
-    """Mass, first moment and tensor about the root's origin of a link with pose T, as a table (4, 4).
-
-    Row 0 holds the mass, column 0 below it the first moment, and the rest the tensor. Tables add up.
-    """
-    table = np.zeros((4, 4))
-    mass = None if inertial is None else inertial.mass
-    if inertial is None or not mass or not (np.isfinite(mass) and mass > 0):
-        return table
-    frame = T @ origin_of(inertial)
-    centre = frame[:3, 3]
-    table[0, 0], table[1:4, 0] = mass, mass * centre
-    table[1:4, 1:4] = mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    if inertial.inertia is not None and np.isfinite(inertial.inertia).all():
-        table[1:4, 1:4] += frame[:3, :3] @ np.asarray(inertial.inertia, float) @ frame[:3, :3].T
-    return table
+def _body(inertial: Inertial, T: NDArray) -> MassProperties:
+    """A link with pose T, shape (4, 4), in the root's frame; without a tensor, a point."""
+    tensor = np.zeros((3, 3)) if inertial.inertia is None else np.asarray(inertial.inertia, float)
+    return MassProperties(float(inertial.mass or 0.0), np.zeros(3), tensor).moved(T @ origin_of(inertial))

@@ -125,22 +125,8 @@ def check_map_layer(path: str | os.PathLike[str]) -> None:
         )
 
 
-def checksums(prim: Usd.Prim) -> tuple[str, str]:
-    """The stored and the computed checksum of a map.
-
-    Raises:
-        InputError: An array is missing or of another type; names the prim.
-    """
-    return get(prim, "checksum"), _checksum(*_arrays(prim))
-
-
 def _arrays(prim: Usd.Prim) -> tuple[NDArray, NDArray, NDArray, dict[str, NDArray] | None, NDArray]:
     """What the checksum covers: values, flags and variances, flat, the harmonic field, and the grid."""
-    if prim.HasAttribute("magtwin:anomalyMap:tileCells"):
-        raise InputError(
-            f"{place(prim)}: is in tiles, which were for large maps and are not read any more; make the map "
-            "anew, or save it in parts with the magtwin that wrote it (`map.part(x_m, y_m).save(FILE)`)"
-        )
     version = get(prim, "checksumVersion")
     if version != CHECKSUM_VERSION:
         raise InputError(

@@ -123,20 +123,17 @@ def test_closing_the_map_leaves_what_naive_errs_by_on_an_exact_map(made, found, 
     assert closed == pytest.approx(np.nanmean(np.abs(error)), rel=1e-3)  # headings by arctan, tilt left out
 
 
-def test_a_run_of_another_scene_is_refused(drives, truth, found, train):
-    changed = drives["d2"].with_metadata(config_sha256="0" * 64)
-    other = replace(found, judged=(replace(found.judged[0], name="d9", run=changed),))
-    with pytest.raises(InputError, match="d9: was made in a scene whose values have the sha256 0000"):
-        budget(other, 0, truth, train)
-
-
-def test_a_run_of_no_known_session_is_refused(twin):
-    with pytest.raises(InputError, match="name no valid session"):
-        in_session_of(twin, {"session_seed": 1, "session": "monday"})
-
-
-def test_a_run_without_the_truth_is_refused(drives, truth, found, train):
-    bare = Run({k: v for k, v in drives["d2"].items() if k != "b_truth_nt"}, drives["d2"].metadata)
-    other = replace(found, judged=(replace(found.judged[0], name="d8", run=bare),))
-    with pytest.raises(InputError, match="d8: has no b_truth_nt, and an error budget needs the truth"):
-        budget(other, 0, truth, train)
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (
+            lambda run: run.with_metadata(config_sha256="0" * 64),
+            "made in a scene whose values have",
+        ),
+        (lambda run: Run({k: v for k, v in run.items() if k != "b_truth_nt"}, run.metadata), "no b_truth_nt"),
+    ],
+)
+def test_a_run_of_another_scene_or_without_the_truth_is_refused(drives, truth, found, train, change, text):
+    judged = replace(found.judged[0], name=text, run=change(drives["d2"]))
+    with pytest.raises(InputError, match=text):
+        budget(replace(found, judged=(judged,)), 0, truth, train)

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import onnxruntime
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from test_calibrate import FIELD
@@ -15,6 +16,7 @@ from magtwin.files.file import sha256, shipped
 from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.data.origin import same_robot
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+from magtwin.learn.inference.onnx import export_onnx
 from magtwin.learn.inference.reader import Reader
 from magtwin.learn.models.calibration import Spread
 from magtwin.learn.models.linear import Linear
@@ -83,21 +85,9 @@ def test_every_kind_keeps_them_in_its_file_and_a_live_robot_reads_them(wide, tmp
         signals = {"odom_v": (0.31, 0.0, 0.0)}
         live = Reader(back, FIELD).read((0.3, 0.4), 0.0, signals)
         assert_allclose(live.b_sd_nt, back.wide_sd_nt(x)[1], rtol=1e-12)
-        figures = {figure.name: figure.value for figure in back.report("it").figures}
-        assert figures["sd, other robots"] == pytest.approx(model.wide.mean_nt)
-
-
-def test_an_exported_network_states_them(wide, tmp_path):
-    onnxruntime = pytest.importorskip("onnxruntime")
-    pytest.importorskip("onnx")
-    from magtwin.learn.inference.onnx import export_onnx
-
-    wide.save(tmp_path / "w.safetensors")
-    export_onnx(tmp_path / "w.safetensors", tmp_path / "w.onnx")
-    x = np.array([[0.15], [0.31]])
-    session = onnxruntime.InferenceSession(tmp_path / "w.onnx", providers=["CPUExecutionProvider"])
-    (sd,) = session.run(["sd_nt"], {"features": x})
-    assert_allclose(sd, wide.wide_sd_nt(x), rtol=1e-9)
+        export_onnx(tmp_path / f"{name}.safetensors", tmp_path / f"{name}.onnx")
+        session = onnxruntime.InferenceSession(tmp_path / f"{name}.onnx", providers=["CPUExecutionProvider"])
+        assert_allclose(session.run(["sd_nt"], {"features": x})[0], back.wide_sd_nt(x), rtol=1e-9)
 
 
 def test_a_file_whose_spread_on_other_robots_is_damaged_is_refused(wide, tmp_path):
@@ -129,9 +119,7 @@ def test_the_command_widens_a_file_and_carries_its_card_over(tmp_path, capsys):
 
 def test_what_cannot_be_learned_from_is_refused():
     runs = {f"r{k}": a_robot(k) for k in range(3)}
-    with pytest.raises(
-        InputError, match="recordings of 3 robots: how robots differ is learned from 4 or more"
-    ):
+    with pytest.raises(InputError, match="recordings of 3 robots: how robots differ is learned from 4"):
         widen(a_linear(), runs, anomaly_map=FIELD)
     with pytest.raises(InputError, match="trained on the map 'lab', and its errors on another, 'trough'"):
         widen(HYBRID, runs, anomaly_map=FIELD)

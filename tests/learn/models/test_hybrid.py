@@ -41,13 +41,6 @@ def test_outside_its_training_the_network_stays_as_at_the_edge_and_the_base_goes
     assert hybrid.outside(far).tolist() == [True]
 
 
-def test_nan_in_gives_nan_out_in_that_row_alone(hybrid):
-    x = np.zeros((20, 2))
-    x[3, 1] = np.nan
-    mean, _ = hybrid.predict(x)
-    assert np.flatnonzero(np.isnan(mean)).tolist() == [3]
-
-
 def test_the_base_alone_is_a_hybrid_without_a_network(hybrid):
     alone = Hybrid(base=hybrid.base, net=None)
     x = np.zeros((3, 2))

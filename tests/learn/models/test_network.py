@@ -148,22 +148,20 @@ def test_a_weights_file_that_does_not_hold_together_is_refused(tmp_path, change,
     assert text in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [(b"", "is empty"), (b"weights", "no weights"), (b"\x89PNG\r\n\x1a\n" + bytes(20), "no weights")],
+)
+def test_a_file_of_another_kind_is_refused(tmp_path, content, text):
+    (tmp_path / "n.bin").write_bytes(content)
+    with pytest.raises(InputError, match=text):
+        load_predictor(tmp_path / "n.bin")
+    with pytest.raises(InputError, match="a folder; give a weights file"):
+        load_predictor(tmp_path)
+
+
 def test_a_truncated_weights_file_is_refused(tmp_path):
     path = changed(tmp_path)
     path.write_bytes(path.read_bytes()[:-10])
-    with pytest.raises(InputError, match=r"damaged safetensors \(.*\); get the file again"):
+    with pytest.raises(InputError, match="damaged safetensors"):
         load_predictor(path)
-
-
-@pytest.mark.parametrize("content", [b"", b"weights", b"\x89PNG\r\n\x1a\n" + bytes(20)])
-def test_a_file_of_another_kind_is_refused(tmp_path, content):
-    path = tmp_path / "n.bin"
-    path.write_bytes(content)
-    text = "no weights: neither safetensors nor a PyTorch checkpoint" if content else "n.bin: is empty"
-    with pytest.raises(InputError, match=text):
-        load_predictor(path)
-
-
-def test_a_folder_is_refused(tmp_path):
-    with pytest.raises(InputError, match="a folder; give a weights file"):
-        load_predictor(tmp_path)
