@@ -7,8 +7,8 @@ import pytest
 import yaml
 from numpy.testing import assert_allclose, assert_array_equal
 from recordings import START, UPRIGHT, as_db3, inertial, magnetic, moved, pose, record, stamped
+from refusing import refused
 from scipy.spatial.transform import Rotation
-from test_cli import refused
 
 from magtwin.cli import main
 from magtwin.errors import InputError, RepairWarning
