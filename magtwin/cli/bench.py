@@ -125,7 +125,7 @@ def compare(a: Path, b: Path, *, out: Path | None = None, force: Force = False) 
         Folder of results to subtract, with the same scenarios and seeds, such as those of another version of
         a localizer.
     out
-        Page to write: .html, .md or .json. Default: none; the result is printed.
+        Page to write: .html or .json. Default: none; the result is printed.
     """
     from magtwin.bench.report import compare_results
 
