@@ -4,11 +4,12 @@ import os
 import pickle
 import shutil
 import zipfile
+from functools import partial
 
 import numpy as np
 import pytest
+from refusing import refused
 
-from magtwin.cli import main
 from magtwin.files.file import shipped
 from magtwin.run.run import Run
 
@@ -88,16 +89,4 @@ def odd(files, tmp_path_factory):
 @pytest.fixture
 def refusal(capsys):
     """A function that gives the one line with which a command is refused."""
-
-    def refused(*words):
-        with pytest.raises(SystemExit) as stop:
-            main([str(word) for word in words])
-        error = capsys.readouterr().err
-        lines = [line for line in error.splitlines() if not line.startswith("  ")]  # steps are indented
-        assert stop.value.code in (1, 2), error
-        assert len(lines) == 1, error
-        assert lines[0].startswith("magtwin: "), error
-        assert "a fault in magtwin" not in lines[0]
-        return lines[0]
-
-    return refused
+    return partial(refused, capsys)

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from recordings import as_db3
-from refusals import refused
+from refusing import refused
 from test_run import assert_same, every_column
 from test_tables import few_bytes
 

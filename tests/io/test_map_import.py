@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from recordings import record
-from refusals import refused
+from refusing import refused
 from test_recorded import poses, readings
 from test_stuck import gridded
 

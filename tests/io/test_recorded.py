@@ -7,7 +7,7 @@ import pytest
 import yaml
 from numpy.testing import assert_allclose, assert_array_equal
 from recordings import START, UPRIGHT, as_db3, inertial, magnetic, moved, pose, record, stamped
-from refusals import refused
+from refusing import refused
 from scipy.spatial.transform import Rotation
 
 from magtwin.cli import main
