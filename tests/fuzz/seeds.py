@@ -253,14 +253,9 @@ def _survey(file: Path) -> None:
 
 
 def _recording(file: Path) -> None:
-    from magtwin.io.release import _SHAPES
+    from magtwin.io.release import _SIZES
 
-    def value(shape: Any) -> Any:
-        if shape == 1:
-            return 1.0
-        return [0.5] * shape if isinstance(shape, int) else [value(part) for part in shape]
-
-    frame = {key: value(shape) for key, shape in _SHAPES.items()}
+    frame: dict[str, Any] = {key: 1.0 if size == 1 else [0.5] * size for key, size in _SIZES.items()}
     frame |= {"nn_magnetic_magnitude": 45000.0, "timestamp": 1.5}
     file.write_text(json.dumps([frame, frame | {"timestamp": 1.6}]))
 
