@@ -12,6 +12,7 @@ CORPUS = Path(__file__).with_name("corpus")
 
 OTHERS = {
     **{kind: (kind,) for kind in ("dataset", "glb", "npz", "usdz", "xacro")},
+    "ply": ("stl", "stl-text"),
     "usda.glb": ("usda", "robot"),
     "usda.info": ("usda", "robot"),
     "usda.magnetics": ("scene-magnetics", "usda"),
