@@ -17,11 +17,16 @@ from magtwin.urdf.report import ConversionReport
 if TYPE_CHECKING:
     from magtwin.author.robot import RobotSettings
     from magtwin.spec.robot import RobotSpec
+    from magtwin.urdf.description.kinematics import link_poses
     from magtwin.urdf.write import write_urdf
 
-__all__ = ["DriveRule", "Options", "Robot", "RobotSettings", "from_urdf", "write_urdf"]
+__all__ = ["DriveRule", "Options", "Robot", "RobotSettings", "from_urdf", "link_poses", "write_urdf"]
 
-LATER = {"RobotSettings": "magtwin.author.robot", "write_urdf": "magtwin.urdf.write"}
+LATER = {
+    "RobotSettings": "magtwin.author.robot",
+    "link_poses": "magtwin.urdf.description.kinematics",
+    "write_urdf": "magtwin.urdf.write",
+}
 """Modules of names that are imported when they are used: what a conversion without settings does without."""
 
 

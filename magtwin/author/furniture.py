@@ -70,7 +70,7 @@ class FurnitureTable(Spec):
     """Depth, width and height of a box; diameter, diameter and height of a cylinder [m]."""
 
     file: Path | None = None
-    """File of a mesh: .stl, .obj, .dae, .glb or .gltf. The mesh is put on the floor, the middle of its
+    """File of a mesh: .stl, .obj, .ply, .dae, .glb or .gltf. The mesh is put on the floor, the middle of its
     footprint at p_world. A steel mesh must be closed."""
 
     scale: float = 1.0

@@ -283,7 +283,7 @@ _BY_SUFFIX: dict[str, Callable[[Path], Kind | None]] = {
     **dict.fromkeys((".png", ".jpg", ".jpeg", ".svg", ".gif", ".mp4", ".pgm"), _is(PICTURE)),
     **dict.fromkeys((".html", ".md"), _is(PAGE)),
     **dict.fromkeys((".yaml", ".yml"), _kind_of_yaml),
-    **dict.fromkeys((".stl", ".obj", ".dae", ".glb", ".gltf"), _is(MESH)),
+    **dict.fromkeys((".stl", ".obj", ".dae", ".glb", ".gltf", ".ply"), _is(MESH)),
     **dict.fromkeys((".sdf", ".world"), _is(GAZEBO)),
     **dict.fromkeys((".zip", ".gz", ".tgz", ".tar", ".xz", ".bz2", ".7z", ".zst"), _is(ARCHIVE)),
 }

@@ -6,6 +6,8 @@ from made import joint, link, urdf
 from numpy.testing import assert_allclose
 from pxr import Usd, UsdGeom, UsdPhysics
 
+from magtwin.author.from_urdf import link_poses
+from magtwin.errors import InputError
 from magtwin.frames import matrix_from_quat
 from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.options import Options
@@ -209,3 +211,23 @@ def test_a_floating_joint_holds_nothing_and_a_floating_base_is_the_base(tmp_path
     assert set(stage.joints) == {"finger", "other", "swing"}
     assert stage.robot.GetPrimAtPath("base/base_footprint")
     assert_allclose(stage.poses({})["plate"][:3, 3], [0.1, 0, 0.3], atol=1e-9)
+
+
+FOLLOWERS = arms(
+    [
+        ("prismatic", f'<axis xyz="0 3 4"/>{LIMIT}'),  # of length 5
+        ("revolute", f'<axis xyz="0 0 2"/>{LIMIT}<mimic joint="j1" multiplier="2" offset="0.1"/>'),
+        ("revolute", f'<origin xyz="1 0 0"/><axis xyz="0 0 1"/>{LIMIT}<mimic joint="j2" multiplier="-1"/>'),
+    ],
+)
+
+
+def test_links_stand_where_an_axis_of_any_length_and_followers_of_followers_put_them(tmp_path):
+    file = urdf(tmp_path, FOLLOWERS, "followers")
+    poses, turn = link_poses(file, {"j1": 0.5}), 2 * 0.5 + 0.1
+    assert_allclose(poses["l1"][:3, 3], [0, 0.3, 0.4], atol=1e-15)
+    assert_allclose(poses["l2"][:2, 0], [np.cos(turn), np.sin(turn)], atol=1e-15)
+    assert_allclose(poses["l3"][:3, 3], [np.cos(turn), 0.3 + np.sin(turn), 0.4], atol=1e-15)
+    for positions, text in (({"j9": 1.0}, "no joint .*'j9'"), ({"j2": 1.0}, "'j2' follows 'j1'")):
+        with pytest.raises(InputError, match=text):
+            link_poses(file, positions)

@@ -20,6 +20,7 @@ READERS: Mapping[str, str] = {
     ".glb": "gltf",
     ".gltf": "gltf",
     ".obj": "wavefront",
+    ".ply": "scan",
     ".stl": "scan",
 }
 """Module beside this one by suffix of the files that it reads, imported when first needed."""
