@@ -80,8 +80,8 @@ def tables_of(page):
     section = title = ""
     head, found = [], {}
     for line in page.read_text().splitlines():
-        if heading := re.search(r"<h([23])>(.*?)</h", line):
-            section, title = (heading[2], "") if heading[1] == "2" else (section, heading[2])
+        for level, heading in re.findall(r"<h([23])>(.*?)</h", line):
+            section, title = (heading, "") if level == "2" else (section, unescape(heading))
         if line.startswith("<thead>"):
             head = re.findall(r"<th [^>]*>(.*?)</th>", line)
         elif line.startswith('<tr><th scope="row">'):
