@@ -531,8 +531,9 @@ def step(
         lanes[:] = 0.0
         move(work, numbers, key, start)
         for k in range(2 if few else STATES):
+            mean_k, a = mean[k], decays[k]
             for n in range(BLOCK):
-                work[MEAN + k, n] *= decays[k]
+                mean_k[n] *= a
         if sampled:
             draw_errors(work, noise, kinds, key, start)
         if used:

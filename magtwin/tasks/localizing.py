@@ -217,21 +217,7 @@ def localize(
         InputError: A file or a column is missing, the run is off the map, there is no prior and no true pose,
             or the method fails.
     """
-    return localization(
-        run,
-        anomaly_map,
-        method=method,
-        options=options,
-        prior=prior,
-        sensor=sensor,
-        odometry=odometry,
-        map_length_m=map_length_m,
-        compensator=compensator,
-        calibration=calibration,
-        rate_hz=rate_hz,
-        seed=seed,
-        progress=progress,
-    ).run
+    return localization(**locals()).run
 
 
 def localization(

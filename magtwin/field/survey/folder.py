@@ -216,8 +216,8 @@ def _read_layer(path: Path, heading_deg: float, unit: str, scale: float | None) 
             cell = str(table.column(label).cells[row]).strip()
             why = "".join(f"; {note}" for note in table.notes if "cut short" in note)
             raise InputError(
-                f"{where(row)}: {label} is missing, got {cell!r}; every node needs a finite value; measure "
-                f"it, or copy the file again{why}"
+                f"{where(row)}: {label} is missing, got {cell!r}; every node needs a finite value, measure "
+                f"it or copy the file again{why}"
             )
     field = nt_per(unit, scale) * values["field"]
     if len(low := np.flatnonzero(field <= 0)):
