@@ -70,6 +70,7 @@ def test_what_leaves_the_machine_is_noted_also_from_a_child(watched, tmp_path):
     notes.unlink()
 
 
+@pytest.mark.slow
 def test_commands_ask_no_host_and_write_nothing_into_a_home_folder_but_caches(watched, tmp_path):
     environment, notes = watched
     command = [sys.executable, "-c", ALL, COMMANDS.strip()]
