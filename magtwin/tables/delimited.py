@@ -1,7 +1,7 @@
 """Delimited text: rows of words in a file of another program, such as a spreadsheet or a script.
 
 Encoding, separator and header are found from the text. `notes` has what was repaired: lines above the header,
-headers that are repeated, decimal commas, and a last line that was cut short.
+headers that are repeated, decimal commas, marks between thousands, and a last line that was cut short.
 """
 
 import codecs
@@ -45,6 +45,14 @@ such as #DIV/0!."""
 _NUMBER = re.compile(r"\s*[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
 _COMMA = re.compile(r"\s*[+-]?(\d{1,3}(\.\d{3})+|\d*),\d+([eE][+-]?\d+)?\s*", re.ASCII)
 """A number with a decimal comma, and perhaps with points between its thousands."""
+
+_THOUSANDS = re.compile(
+    r"\s*[+-]?[1-9]\d{0,2}(?P<mark>[,'\u2019 \u00a0\u202f])\d{3}((?P=mark)\d{3})*(?P<rest>[.,]\d*)?\s*",
+    re.ASCII,
+)
+"""A number with marks between its thousands: English commas, Swiss apostrophes or French blanks."""
+
+_BELOW_1000 = re.compile(r"\s*[+-]?\d{1,3}([.,]\d*)?\s*", re.ASCII)
 
 _BEGUN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d*)?([eE][+-]?)?", re.ASCII)
 """The begin of a number."""
@@ -107,9 +115,9 @@ def read_delimited(path: str | os.PathLike[str], noun: str, wanted: str) -> Deli
     begin with `/` if the first line does; empty lines; a first line `sep=;`; lines of prose above the header
     and one below the rows; headers that are repeated; and the lines `Line 10` and `Tie 3` of Geosoft. The
     units in a row below the header are added to the names, as in `x [cm]`. A decimal comma is read unless
-    commas separate the words or other numbers have decimal points. If the last line has no end, it is left
-    out if it has fewer words than others; its last number is missing if it is far below all others of its
-    column.
+    commas separate the words or other numbers have decimal points. Marks between thousands are read if all
+    numbers of the column fit. If the last line has no end, it is left out if it has fewer words than others;
+    its last number is missing if it is far below all others of its column.
 
     Args:
         path: The file.
@@ -172,8 +180,8 @@ def _is_cut_short(column: Sequence[str]) -> bool:
 
 
 def _is_number(word: str) -> bool:
-    """Whether a word is a number, perhaps with a decimal comma."""
-    return math.isfinite(number_of(word)) or bool(_COMMA.fullmatch(word))
+    """Whether a word is a number, perhaps with a decimal comma or marks between thousands."""
+    return math.isfinite(number_of(word)) or bool(_COMMA.fullmatch(word) or _THOUSANDS.fullmatch(word))
 
 
 def _is_text(word: str) -> bool:
@@ -183,7 +191,9 @@ def _is_text(word: str) -> bool:
 
 def _is_header(words: list[str]) -> bool:
     """Whether a word of the first row is not a number, and none is one with a comma."""
-    return any(map(_is_text, words)) and not any(_COMMA.fullmatch(w) for w in words)
+    return any(map(_is_text, words)) and not any(
+        _COMMA.fullmatch(w) or _THOUSANDS.fullmatch(w) for w in words
+    )
 
 
 def _header(rows: _Rows) -> int:
@@ -374,7 +384,10 @@ def _words(path: Path, lines: _Lines, between: str | None) -> _Rows:
 
 
 def _plain_numbers(names: list[str], rows: list[list[str]], between: str | None, notes: list[str]) -> None:
-    """Make decimal commas points, unless commas separate the words or other numbers have points."""
+    """Take marks between thousands out of the rows, and make decimal commas points."""
+    if columns := _without_thousands(rows):
+        named = ", ".join(names[k] if names else str(k + 1) for k in columns)
+        notes.append(f"numbers of {named[:QUOTED]} with marks between thousands")
     if between == "," or not any(_COMMA.fullmatch(word) for row in rows for word in row if "," in word):
         return
     if any(_NUMBER.fullmatch(word) for row in rows for word in row if "." in word):
@@ -392,3 +405,33 @@ def _without_begun(number: int, rows: list[list[str]], notes: list[str]) -> None
         why = "begins a number" if begun else "is far below all other values"
         notes.append(f"line {number} as cut short and left out: it has no end, and its {last[:QUOTED]} {why}")
         rows[-1][-1] = ""
+
+
+def _without_thousands(rows: list[list[str]]) -> list[int]:
+    """Take the marks between thousands out of the columns all of whose numbers fit; returns these columns.
+
+    A comma may be a decimal one. It is between thousands if a number has a point after it, or two of them.
+    """
+    found = {
+        k: match["mark"]
+        for row in rows
+        for k, word in enumerate(row)
+        if len(word) > 4 and (match := _THOUSANDS.fullmatch(word))
+    }
+    columns = []
+    for k, mark in found.items():
+        words = [row[k] for row in rows]
+        matches = [_THOUSANDS.fullmatch(word) for word in words]
+        fits = all(
+            match["mark"] == mark
+            if match
+            else math.isnan(number_of(word)) or (mark not in word.strip() and _BELOW_1000.fullmatch(word))
+            for word, match in zip(words, matches, strict=True)
+        )
+        ends = {match["rest"][0] for match in matches if match and match["rest"]}
+        sure = mark != "," or "." in ends or any(word.count(mark) > 1 for word in words)
+        if fits and sure and mark not in ends:
+            columns.append(k)
+            for row in rows:
+                row[k] = row[k].strip().replace(mark, "")
+    return columns

@@ -285,6 +285,29 @@ def test_the_xyz_of_geosoft_is_read(tmp_path):
     assert topics.names == ["/odom/x", "/odom/y"]
 
 
+@pytest.mark.parametrize(
+    ("cells", "values"),
+    [
+        (['"45,529.4"', "999.5", ""], [45529.4, 999.5, np.nan]),
+        (['"1,234,567"', '"-2,000"', "7"], [1234567, -2000, 7]),
+        (["45'529.4", "1'000", "0.5"], [45529.4, 1000, 0.5]),
+        (["45\u202f529.4", "1\u202f000", "nan"], [45529.4, 1000, np.nan]),
+        (['"45,529"', '"45,530"', '"45,531"'], "45,529"),
+        (['"45,529.4"', '"0,584"', "1"], "45,529.4"),
+        (['"45,529.4"', "45529.5", "1"], "45,529.4"),
+        (["45'529", "45.5291e3", "1"], "45'529"),
+    ],
+)
+def test_marks_between_thousands_are_read_if_all_numbers_of_a_column_fit(tmp_path, cells, values):
+    table = read_table(written(tmp_path, "x,b\n" + "".join(f"0.5,{cell}\n" for cell in cells)))
+    if isinstance(values, str):
+        with pytest.raises(InputError, match=rf"a\.csv:2: b must be a finite number, got ['\"]{values}"):
+            table.numbers("b")
+        return
+    assert_array_equal(table.numbers("b"), values)
+    assert table.notes == ("numbers of b with marks between thousands",)
+
+
 def test_a_column_is_found_by_its_name_without_a_unit(tmp_path):
     table = read_table(written(tmp_path, "East (cm),b [uT],b [nT],b\n1,2,3,4\n"))
     assert_array_equal(table.numbers("East"), [1])
