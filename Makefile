@@ -15,7 +15,7 @@ MOST_MB := 2700
 # Two processes whose linear algebra has threads of its own wait for each other more than they work.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 
-.PHONY: fuzz faults demo test test-slow readme simready blender ros released physics physx lint paper bench zoo wheel-test schema assets pictures clean help
+.PHONY: startup fuzz faults demo test test-slow readme simready blender ros released physics physx lint paper bench zoo wheel-test schema assets pictures clean help
 
 help:  ## Say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -83,6 +83,9 @@ fuzz: $(VENV)/.dev  ## Damage files of every format at random and read them (SEC
 
 faults: $(VENV)/.dev  ## Fill the disk, or kill the process, at each write of every command (Linux, a C compiler; SEED=0)
 	$(ONE_THREAD) $(BIN)/python tests/faults/faults.py --seed $(or $(SEED),0)
+
+startup: $(VENV)/.dev  ## Measure what small commands cost, as ratios; fails if one fell by 15 %
+	$(BIN)/python benchmarks/startup.py
 
 bench: $(VENV)/.dev  ## Compare with peers; prints ratios
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
