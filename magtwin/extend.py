@@ -1,4 +1,4 @@
-"""Decorators that add to magtwin without a fork. `examples/extend/` has an example of each.
+"""Decorators that add to magtwin without a fork. `examples/extend/` has examples.
 
 | decorator | what it registers | use |
 |---|---|---|
@@ -15,7 +15,8 @@
 
 An installed package can announce them as entry points instead, in the groups `magtwin.sensors`,
 `magtwin.interference`, `magtwin.controllers`, `magtwin.engines`, `magtwin.paths`, `magtwin.map_methods`,
-`magtwin.predictors`, `magtwin.localizers` and `magtwin.formats`; then they are known on the command line too:
+`magtwin.predictors`, `magtwin.localizers`, `magtwin.formats` and `magtwin.rules`; then the command line knows
+those that it has an option for:
 
     [project.entry-points."magtwin.map_methods"]
     kriging = "my_package.kriging:fit_kriging"

@@ -184,7 +184,7 @@ def smooths(entry: Entry) -> bool:
 def _warm_up(entry: Entry, case: Case) -> None:
     """Run a localizer of magtwin on a few readings once, so that no run's time has compilation in it.
 
-    Localizers of others are left alone: what they do wrong counts in their runs.
+    Localizers that are given as MODULE:CLASS are left alone: what they do wrong counts in their runs.
     """
     if ":" in entry.method or repr(entry) in _warm:
         return

@@ -1,7 +1,7 @@
-"""Children: the programs that magtwin starts, each with a home folder of its own and without the network.
+"""Children: the programs that magtwin starts, each with a home folder of its own and a dead proxy.
 
-A program may write settings, caches and identifiers into HOME, or ask hosts for news. A child cannot: its
-HOME is a temporary folder, removed when it ends, and its requests go to a proxy that cannot exist.
+A program may write settings, caches and identifiers into HOME, or ask hosts for news. The HOME of a child is
+a temporary folder, removed when it ends; a program that honours the proxy settings reaches no host.
 """
 
 import json
@@ -39,7 +39,7 @@ def environment(home: str, changes: Changes = _NONE) -> dict[str, str]:
         home: Folder for its settings, caches and temporary files; `os.devnull` for a child that writes none.
         changes: Other variables; None removes one.
     """
-    # Packages that `pip install --user` put there, and the right to open windows.
+    # From the user's home: packages of `pip install --user`, and the right to open windows.
     same = {"PYTHONUSERBASE": site.getuserbase(), "XAUTHORITY": _user("~/.Xauthority")}
     changed = {**dict.fromkeys(_LOUD), **_QUIET, **dict.fromkeys(_HOMES, home), **changes}
     return {name: v for name, v in {**same, **os.environ, **changed}.items() if v is not None}

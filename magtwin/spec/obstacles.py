@@ -12,8 +12,8 @@ from magtwin.report.summary import Summarized, Summary, listed
 
 Array = NDArray[np.float64]
 
-LEVEL_M = 1e-9
-"""A vertex nearer than this to the line through its neighbours is no corner [m]."""
+COLLINEAR_M = 1e-9
+"""A point nearer than this to the line through the two before it makes no corner [m]."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -115,12 +115,12 @@ def _hull(name: str, points: ArrayLike) -> Array:
 
 
 def _half(points: Sequence[list[float]]) -> list[list[float]]:
-    """Lower hull of points in order."""
+    """Half of a hull: of points in order, those at which the outline turns left."""
     chain: list[list[float]] = []
     for x, y in points:
         while len(chain) >= 2:
             (x0, y0), (x1, y1) = chain[-2], chain[-1]
-            if (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) > LEVEL_M * np.hypot(x1 - x0, y1 - y0):
+            if (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) > COLLINEAR_M * np.hypot(x1 - x0, y1 - y0):
                 break
             chain.pop()
         chain.append([x, y])

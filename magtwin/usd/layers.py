@@ -68,7 +68,7 @@ def describe_stage(stage: Usd.Stage, documentation: str) -> None:
 def open_stage(path: str | os.PathLike[str], *, own: bool = False) -> Usd.Stage:
     """Open the stage of a USD file, reloaded from disk.
 
-    Attributes of magtwin that the schema does not define cause a warning, as does a later schema.
+    Attributes of magtwin that the schema does not define cause a warning.
 
     Args:
         path: The file.

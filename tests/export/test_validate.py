@@ -1,5 +1,6 @@
 """Validators in one answer: a few lines break each rule, damaged files end nothing, mends mend."""
 
+import importlib
 import json
 import os
 import shutil
@@ -339,3 +340,19 @@ def test_a_validator_that_there_is_not_is_refused_by_the_near_one(tmp_path):
     (tmp_path / "a.usda").write_text(HEAD)
     with pytest.raises(InputError, match="no validator 'isac'; did you mean 'isaac'"):
         validate(tmp_path / "a.usda", ["isac"])
+
+
+def test_a_rule_of_ones_own_is_checked_beside_those_that_ship(lab_scene, tmp_path, monkeypatch):
+    (tmp_path / "house_rules.py").write_text(
+        "from magtwin.extend import rule\n"
+        "from magtwin.export.validation.rule import Wrong\n\n\n"
+        "@rule('magtwin', 'take another lab')\n"
+        "def not_this_lab(subject):\n"
+        '    """No lab is good enough."""\n'
+        "    yield Wrong('it is a lab', '/World')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("magtwin.export.validation.rule.RULES", {"magtwin": {}})
+    importlib.import_module("house_rules")
+    report = validate(lab_scene, against=["magtwin"])
+    assert "not-this-lab" in {finding.rule for check in report.checks for finding in check.findings}

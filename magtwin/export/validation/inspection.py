@@ -51,6 +51,7 @@ def inspect(
     Raises:
         InputError: The file crashes its reader, is no stage, or names files outside its folder.
     """
+    from magtwin.export.validation.rule import added_modules
     from magtwin.usd.layers import check_stage
 
     check_stage(root or file)
@@ -60,6 +61,8 @@ def inspect(
         "home": None if home is None else str(home),
         "against": sorted(against),
         "inputs": None if inputs is None else sorted(inputs),
+        "rules": added_modules(),
+        "path": sys.path,
     }
     patience = PATIENCE_S + file.stat().st_size / 1e6
     result, done = answer_of("magtwin.export.validation.inspection", job, patience)
@@ -97,6 +100,9 @@ def _look(job: dict[str, Any]) -> dict[str, Any]:
     from magtwin.export.validation.rules import robot_assets
     from magtwin.usd.schema.versions import version_of
 
+    sys.path += [place for place in job["path"] if place not in sys.path]
+    for module in job["rules"]:
+        importlib.import_module(module)
     file, root = Path(job["file"]), Path(job["root"])
     packed = None if job["home"] is None else Path(job["home"])
     diagnostics = UsdUtils.CoalescingDiagnosticDelegate()  # keeps USD's messages off the terminal

@@ -16,11 +16,12 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.metadata import entry_points
 from pathlib import Path
 
 from pxr import Sdf, Tf, Usd
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, find
 from magtwin.export.validation.findings import Finding, Severity
 from magtwin.usd.placement import lab_on, labs_on, take_to_origin
 from magtwin.usd.schema import prims_with
@@ -144,8 +145,17 @@ Look = Callable[[Subject], Iterator[Wrong]]
 def rule(validator: str, advice: str) -> Callable[[Look], Look]:
     """Decorator that enters a function in `RULES`.
 
-    The rule's name is the function's, with hyphens; its sentence is the first line of the docstring.
+    The rule's name is the function's, with hyphens; its sentence is the first line of the docstring. A stage
+    is checked in another process, which imports the module of the function: it cannot be a script's own.
+
+    Args:
+        validator: "magtwin".
+        advice: What to do if the rule is broken.
+
+    Raises:
+        UnknownNameError: No such validator.
     """
+    find("validator", validator, RULES)
 
     def register(look: Look) -> Look:
         name = look.__name__.replace("_", "-")
@@ -153,6 +163,19 @@ def rule(validator: str, advice: str) -> Callable[[Look], Look]:
         return look
 
     return register
+
+
+def added_modules() -> list[str]:
+    """Modules of the rules that users and installed packages add.
+
+    Raises:
+        InputError: A rule is in a script.
+    """
+    modules = {rule.look.__module__ for rules in RULES.values() for rule in rules.values()}
+    if "__main__" in modules:
+        raise InputError("a rule is in the script that runs; move it to a module, and import that")
+    installed = {point.module for point in entry_points(group="magtwin.rules")}
+    return sorted({name for name in modules if not name.startswith("magtwin.")} | installed)
 
 
 def wrong_of(error: InputError) -> Wrong:
