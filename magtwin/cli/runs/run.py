@@ -36,7 +36,8 @@ Outs = Annotated[list[Path] | None, Parameter(consume_multiple=False)]
 def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False) -> Done:
     """Author a lab and a TurtleBot 4, drive a figure of eight and log what the magnetometer reads.
 
-    It writes the stages, run.rrd (opens in Rerun), run.parquet and pictures, in less than a minute.
+    It writes the stages, run.html (plays the run in a browser), run.rrd (opens in Rerun), run.parquet and
+    pictures, in less than a minute.
 
     Parameters
     ----------
@@ -46,6 +47,7 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False) -> D
     from magtwin.author.robot import build_robot
     from magtwin.author.scene import author_scene
     from magtwin.figures.pictures import picture_of_stage
+    from magtwin.figures.views import report_runs
     from magtwin.files.file import shipped
     from magtwin.files.outputs import output
     from magtwin.io.outputs import Outputs, drive
@@ -64,12 +66,14 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False) -> D
         driven = drive(scene_file, seed=seed, metadata=relative, report=announce)
         announce("Writing the run and pictures")
         Outputs(folder, picture=save_picture).write(driven)
+        report_runs([folder / "run.parquet"], folder / "run.html")
         try:
             picture_of_stage(scene_file, folder / "lab.png")
         except InputError as error:  # OpenGL is missing
             note(f"no picture of the stage: {error}")
     pictures = ", ".join(str(file) for file in sorted(out.glob("*.png")))
-    text = f"\nLook at it:  magtwin view {out / 'run.rrd'}\nPictures:    {pictures}"
+    look = f"{out / 'run.html'} in a browser, or magtwin view {out / 'run.rrd'}"
+    text = f"\nLook at it:  {look}\nPictures:    {pictures}"
     return Done(driven.run.report(f"Demo in {out}"), out, text=text)
 
 
