@@ -261,7 +261,7 @@ class Chart {
       const left = this.x(t[a] / 100);
       parts.push(svg("rect", { class: "lidar", x: left, y: TOP, width: this.x(t[b] / 100) - left, height: bottom - TOP }));
     }
-    for (const value of ticks(low, high, Math.max(3, Math.floor((bottom - TOP) / 40)))) {
+    for (const value of ticks(low, high, Math.max(4, Math.floor((bottom - TOP) / 36)))) {
       parts.push(svg("line", { class: "grid", x1: LEFT, x2: width - RIGHT, y1: this.y(value), y2: this.y(value) }));
       parts.push(svg("text", { x: LEFT - 6, y: this.y(value) + 4, "text-anchor": "end" }, short(value)));
     }
