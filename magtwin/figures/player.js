@@ -16,10 +16,10 @@ main().catch((error) => {
 async function main() {
   const data = await unpack(document.getElementById("player-data").textContent);
   const clock = new Clock(data.arrays.t);
-  const views = [charts(data, clock), bar(data, clock), words(data, clock), table(data)];
+  for (const part of [charts, bar, words, table]) part(data, clock);
   if (data.arrays.x) {
     try {
-      views.push(await stage(data, clock));
+      stage(data, clock);
       root.dataset.state = "live";
     } catch (error) {
       at("note").textContent = `The lab is not drawn: ${error.message}`;
@@ -27,13 +27,12 @@ async function main() {
   }
   const seek = () => { // #t=30&view=top
     const told = new URLSearchParams(location.hash.slice(1));
-    for (const button of at("views").children) if (button.value === told.get("view")) button.click();
+    at("views").querySelector(`[value="${CSS.escape(told.get("view") || "")}"]`)?.click();
     if (told.get("t")) clock.seek(Number(told.get("t")) || 0);
   };
   addEventListener("hashchange", seek);
   seek();
   clock.tell();
-  root.dataset.ready = String(views.length);
 }
 
 // ---- Data
@@ -124,9 +123,8 @@ function words(data, clock) {
   if (a.yaw) shown.push(["heading", (i) => (a.yaw[i] === UNKNOWN ? "unknown" : `${said((((a.yaw[i] / 10) % 360) + 360) % 360, 1)}°`)]);
   const list = at("now");
   const cells = shown.map(([name, text]) => {
-    const cell = document.createElement("div");
+    const cell = list.appendChild(document.createElement("div"));
     cell.append(element("dt", name), element("dd", ""));
-    list.append(cell);
     return [cell.lastChild, text];
   });
   clock.wanting.push(() => { for (const [cell, text] of cells) cell.textContent = text(clock.row); });
@@ -139,11 +137,11 @@ function table(data) {
   for (const chart of data.charts) {
     for (const line of chart.lines) columns.push([`${line.name} [${chart.unit}]`, a[line.column], chart.scale, chart.digits]);
   }
-  const row = (tag, texts) => { const tr = document.createElement("tr"); tr.append(...texts.map((text) => element(tag, text))); return tr; };
-  body.append(row("th", columns.map(([name]) => name)));
+  const row = (tag, texts) => body.insertRow().append(...texts.map((text) => element(tag, text)));
+  row("th", columns.map(([name]) => name));
   for (let k = 0; k <= 10; k++) {
     const i = Math.round((k / 10) * (a.t.length - 1));
-    body.append(row("td", columns.map(([, values, scale, digits]) => (values[i] === UNKNOWN ? "unknown" : said(values[i] * scale, digits)))));
+    row("td", columns.map(([, values, scale, digits]) => (values[i] === UNKNOWN ? "unknown" : said(values[i] * scale, digits))));
   }
 }
 
@@ -329,7 +327,7 @@ class Chart {
 }
 
 const ink = (k) => (k ? "model" : "data");
-const said1 = (value, chart) => (value === UNKNOWN ? "unknown" : said(value * chart.scale, chart.digits));
+const said1 = (value, chart) => said(value === UNKNOWN ? value : value * chart.scale, chart.digits);
 const short = (value) => said(Math.abs(value) < 1e-9 ? 0 : value, Math.abs(value) >= 10 || Number.isInteger(value) ? 0 : 2);
 
 function ticks(low, high, most) {
@@ -392,7 +390,6 @@ precision highp float;
 precision highp sampler2DShadow;
 vec3 seen(vec3 linear) { return pow(clamp(linear, 0., 1.), vec3(1. / 2.2)); }
 `;
-
 const BODY_V = `${COMMON}
 in vec3 p; in vec3 n; in vec4 c;
 uniform mat4 model, camera;
@@ -426,15 +423,12 @@ void main() {
   vec3 out_ = base * (.34 + .16 * N.z + .62 * lit * max(0., dot(N, sun)));
   ink = vec4(seen(out_), pass == 1 ? .11 : 1.);
 }`;
-
 const SHADE_F = `${COMMON}
 in vec3 place, normal; in vec4 colour; out vec4 ink;
 void main() { if (colour.a < .99) discard; ink = vec4(1.); }`;
-
 const FLOOR_V = `${COMMON}
 in vec2 p; uniform mat4 camera; uniform vec4 rect; out vec2 uv;
 void main() { uv = p; gl_Position = camera * vec4(mix(rect.xy, rect.zw, p), .006, 1.); }`;
-
 const FLOOR_F = `${COMMON}
 in vec2 uv; uniform sampler2D values, colours; uniform vec2 size; uniform float step_; out vec4 ink;
 void main() {
@@ -444,11 +438,9 @@ void main() {
   float d = abs(fract(line - .5) - .5) / max(w, 1e-6);
   ink = vec4(texture(colours, vec2(share * 255. / 256. + .5 / 256., .5)).rgb * mix(.72, 1., smoothstep(.3, 1.3, d)), 1.);
 }`;
-
 const TRAIL_V = `${COMMON}
 in vec2 p, across; in vec2 tv; uniform mat4 camera; uniform float half_, z; out vec2 t;
 void main() { t = tv; gl_Position = camera * vec4(p + across * half_, z, 1.); }`;
-
 const TRAIL_F = `${COMMON}
 in vec2 t; uniform float now, most; uniform vec4 plain; uniform int later; uniform sampler2D colours; out vec4 ink;
 void main() {
@@ -462,7 +454,7 @@ const VIRIDIS = ["440154", "472d7b", "3b528b", "2c728e", "21918c", "28ae80", "5e
 const DIVERGING = ["053061", "2166ac", "4393c3", "92c5de", "f7f7f7", "f4a582", "d6604d", "b2182b", "67001f"];
 const gradient = (colours) => `linear-gradient(90deg, ${colours.map((c) => `#${c}`).join(", ")})`;
 
-async function stage(data, clock) {
+function stage(data, clock) {
   const canvas = at("canvas"), a = data.arrays, map = data.map;
   const gl = canvas.getContext("webgl2", { antialias: true, powerPreference: "low-power" });
   if (!gl) throw new Error("no WebGL 2");
@@ -590,7 +582,7 @@ function bodyOf(gl, program, body, arrays) {
   }
   const count = faces.length, flat = new Float32Array(count), meeting = Array.from({ length: welded.size }, () => []);
   for (let f = 0; f < count; f += 3) {
-    const [p, q, r] = [points[faces[f]], points[faces[f + 1]], points[faces[f + 2]]];
+    const [p, q, r] = [0, 1, 2].map((k) => points[faces[f + k]]);
     flat.set(cross(less(q, p), less(r, p)), f);
     for (let k = 0; k < 3; k++) meeting[same[faces[f + k]]].push(f);
   }
@@ -783,7 +775,7 @@ function around(data, lab, rect) {
   if (data.map) { add(rect[0], rect[1]); add(rect[2], rect[3]); }
   const { x, y } = data.arrays;
   if (low[0] === Infinity && x) for (let i = 0; i < x.length; i++) if (x[i] !== UNKNOWN) add(x[i] / 1000, y[i] / 1000);
-  const focus = data.map ? rect : [low[0], low[1], high[0], high[1]];
+  const focus = data.map ? rect : [...low.slice(0, 2), ...high.slice(0, 2)];
   return { low, high, focus, size: Math.hypot(focus[2] - focus[0], focus[3] - focus[1]) };
 }
 
@@ -835,7 +827,7 @@ class Camera {
     this.changed();
   }
   turn(dx, dy) {
-    if (this.mode === "top") return this.take("orbit");
+    if (this.mode === "top") this.take("orbit");
     this.azimuth -= dx / 180;
     this.elevation = Math.min(1.5, Math.max(0.08, this.elevation + dy / 220));
     this.changed();
