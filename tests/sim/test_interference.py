@@ -114,18 +114,6 @@ def test_each_part_of_the_robots_field_enters_by_its_own_law():
     assert_allclose(platform_field_nt(everything, B, **state), total, rtol=1e-12)
 
 
-def test_hard_iron_makes_one_wave_a_turn_of_the_expected_amplitude():
-    platform = PlatformFieldSpec(hard_iron_nt=(300.0, 400.0, 0.0))
-    yaw = np.linspace(0, 2 * np.pi, 360, endpoint=False)
-    b = np.column_stack([24_000 * np.cos(yaw), -24_000 * np.sin(yaw), np.full(360, -38_000.0)])
-    still = {k: np.zeros((360, *v.shape[1:])) for k, v in QUIET.items()}
-    size = np.linalg.norm(platform_field_nt(platform, b, **still), axis=1)
-    wave = np.abs(np.fft.rfft(size)) / 180
-    # |b + h| = |b| + h . b / |b| + O(h^2 / |b|); the last is 500^2 / 45,000 = 6 nT
-    assert wave[1] == pytest.approx(500 * 24_000 / np.hypot(24_000, 38_000), abs=6)
-    assert np.all(wave[2:] < 6)
-
-
 ROLLING = RobotSpec(
     name="r",
     asset=Path("r.usda"),

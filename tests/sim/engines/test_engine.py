@@ -17,7 +17,7 @@ from magtwin.path import figure8, path_named, sine
 from magtwin.run.run import Run
 from magtwin.sim.engines.newton import Newton
 from magtwin.sim.engines.replay import replayed
-from magtwin.sim.motion.commands import Commands, read_commands, write_commands
+from magtwin.sim.motion.commands import Commands, read_commands
 from magtwin.sim.motion.controllers import guide_by_commands
 from magtwin.sim.motion.driver import Driver
 from magtwin.sim.motion.engine import KINEMATIC, Kinematic
@@ -57,18 +57,6 @@ def test_a_run_without_commands_is_not_replayed_for_a_network_that_reads_them(la
     assert np.isfinite(simulate(paper, told)["b_total_nt"]).all()
 
 
-def test_a_replay_of_rows_that_do_not_tell_the_steps_goes_evenly_from_row_to_row(twin):
-    path = figure8(half_length_m=0.6, half_width_m=0.3)
-    slow = simulate(twin, path, seed=3, rate_hz=20)  # more than one step a row
-    assert replayed(slow, DRIVE).step_s is None
-    whole = simulate(twin, path, seed=3)
-    assert replayed(whole, DRIVE).step_s == 0.02
-    cut = Run({name: values[100:] for name, values in whole.items()}, whole.metadata)
-    assert replayed(cut, DRIVE).step_s is None
-    again = simulate(twin, cut, seed=3)
-    assert_allclose(again["p_world_base"], cut["p_world_base"], atol=1e-12)
-
-
 def test_a_replay_between_its_samples_is_the_drive_itself():
     motion = follow(figure8(half_length_m=0.6, half_width_m=0.3), DRIVE, speed=0.2)
     t = np.arange(0, motion.duration_s, 1 / 135)
@@ -103,19 +91,6 @@ def test_a_run_that_cannot_be_replayed_is_refused(t, x, what):
     run = Run({"t": np.array(t, float), "p_world_base": np.column_stack([x, zero, zero]), "yaw": zero})
     with pytest.raises(InputError, match=what):
         replayed(run, DRIVE)
-
-
-def test_commands_are_read_as_they_were_written(tmp_path):
-    rows = np.column_stack([np.arange(5) / 50, np.linspace(0, 1, 5) / 3, np.full(5, 0.1)])
-    write_commands(Commands("mine", rows), tmp_path / "mine.csv")
-    assert_array_equal(read_commands(tmp_path / "mine.csv").rows, rows)
-
-
-def test_commands_of_a_spreadsheet_are_read_with_a_note(tmp_path):
-    (tmp_path / "c.csv").write_text(";w;v;t\n0;0,5;0,1;0,0\n1;-0,5;0,2;1,5\n", encoding="utf-8")
-    with pytest.warns(RepairWarning, match="read numbers with decimal commas; t, v and w by their names"):
-        commands = read_commands(tmp_path / "c.csv")
-    assert commands.rows.tolist() == [[0.0, 0.1, 0.5], [1.5, 0.2, -0.5]]
 
 
 @pytest.mark.parametrize(
@@ -223,12 +198,6 @@ def test_a_driver_covers_the_floor_and_never_bumps(seed):
     assert motion.w.std() > 0.2
 
 
-def test_one_seed_is_one_driver_and_another_seed_another():
-    a, b, c = (drive_about(seed, duration_s=20.0, obstacles=OBSTACLES) for seed in (1, 1, 2))
-    assert_array_equal(a.poses, b.poses)
-    assert not np.array_equal(a.poses[: len(c.poses)], c.poses[: len(a.poses)])
-
-
 def test_run_drives_at_random_by_commands_and_by_replay(lab_scene, tmp_path, capsys):
     arguments = ["run", str(lab_scene), "--network", "none", "--json"]
     once, again = tmp_path / "a.parquet", tmp_path / "b.parquet"
@@ -241,14 +210,6 @@ def test_run_drives_at_random_by_commands_and_by_replay(lab_scene, tmp_path, cap
     assert "|v| above 0.306 m/s" in capsys.readouterr().err
     run = read_parquet(tmp_path / "c.parquet")
     assert 0.05 < run["p_world_base"][-1, 0] - run["p_world_base"][0, 0] < 0.2
-
-
-def test_newton_that_is_not_installed_is_refused_with_how_to_get_it(monkeypatch, lab_scene, capsys):
-    found = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda n, *a: None if n == "newton" else found(n, *a))
-    with pytest.raises(SystemExit):
-        main(["run", str(lab_scene), "--engine", "newton"])
-    assert "pip install 'magtwin[physics]'" in capsys.readouterr().err
 
 
 PHYSICS = [

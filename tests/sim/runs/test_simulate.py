@@ -15,7 +15,6 @@ from magtwin.run.run import COLUMNS, Run
 from magtwin.sim.interference import ambient_gradient_nt_m
 from magtwin.sim.runs.simulate import simulate
 from magtwin.spec.drive import DriveSpec
-from magtwin.spec.lab import LabSpec
 from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
@@ -78,25 +77,6 @@ def test_a_run_has_every_column_in_order_and_no_other():
         if name != "b_sd_nt":
             assert np.all(np.isfinite(values)), name
     assert np.isnan(run["b_sd_nt"]).all()
-
-
-def test_metadata_tell_how_the_run_came_about():
-    run = drive(speed=0.3, duration_s=2.0, lidar="on")
-    assert dict(run.metadata) == {
-        "scene": "known",
-        "path": "line",
-        "controller": "follower",
-        "speed_m_s": 0.3,
-        "robot_name": "robot",
-        "sensor_m": "0.05, 0, 0.36",
-        "mocap_offset_m": "0, 0",
-        "mocap_latency_s": 0.015167,  # 10 ms, a mean jitter of 1 ms, half a period at 120 Hz
-        "rate_hz": 135.0,
-        "duration_s": 2.0,
-        "outside": "nan",
-        "lidar": "on",
-        "magnetometer": "physical",
-    }
 
 
 def test_columns_of_the_truth_agree_with_each_other():
@@ -225,19 +205,6 @@ def test_every_error_has_an_address():
         assert_allclose(off, [50, 0, 0], atol=25)
 
 
-def test_a_physical_magnetometer_reads_the_exact_field_and_one_of_the_map_alone_the_map():
-    exact, known = drive(), with_robot(KNOWN, magnetometer=MagnetometerSpec(kind="map-only"))
-    alone, surveyed = drive(known), drive(with_robot(SURVEYED, magnetometer=known.robot.magnetometer))
-    assert exact.metadata["magnetometer"] == "physical"
-    assert_array_equal(exact["b_total_nt"], exact["b_map_nt"] + (exact["b_truth_nt"] - exact["b_map_nt"]))
-    for run in (alone, surveyed):  # the map is there whether or not the exact field is known
-        assert run.metadata["magnetometer"] == "map-only"
-        assert_array_equal(run["b_total_nt"], run["b_map_nt"])
-        assert_array_equal(run["b_disturbance_nt"], 0)
-    assert_array_equal(alone["b_truth_nt"], exact["b_truth_nt"])
-    assert np.isnan(surveyed["b_truth_nt"]).all()
-
-
 STEEP = SourceSpec(name="beam", p_world=(0.0, 0.35, 0.36), m_world=(0.0, 0.0, 3.0))
 """Beside the middle of LINE, at the magnetometer's height and 15 cm from where it comes by."""
 
@@ -265,17 +232,6 @@ def test_lock_is_lost_beside_steel_and_found_again_farther_on():
         run["b_measured_nt"][~lost],
         drive(with_robot(scene, magnetometer=MagnetometerSpec()))["b_measured_nt"][~lost],
     )
-
-
-def test_a_wall_that_a_corner_swings_over_is_a_bump():
-    # A fold at the very edge: turning on the spot after stopping leaves the robot a fraction of a
-    # millimetre over, which a floor that ends there feels.
-    edge = Path("edge", np.array([[-0.5, 0.2], [0.5, 0.2], [0.5, -0.2]]))
-    tight = dataclasses.replace(KNOWN, lab=LabSpec(floor_m=(2 * (0.5 + 0.171), 3.5)))
-    run = drive(tight, edge)
-    reach = np.abs(run["p_world_base"][:, 0]) + 0.171
-    assert_array_equal(run["flag_bump"], reach > 0.671 + 1e-9)
-    assert run["flag_bump"].any()
 
 
 def test_one_seed_gives_identical_arrays_and_another_gives_others():

@@ -5,7 +5,7 @@ import pytest
 from clocks import held
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_array_equal
 
 from magtwin.errors import InputError
 from magtwin.run.run import Run
@@ -138,15 +138,6 @@ def test_a_model_error_and_scans_give_the_same_bytes_in_pieces():
     by_steps = Scanner(robot, wall, generator(4))
     pieces = [scan(by_steps, until) for until in np.arange(1, 401) * 0.02]
     assert_same_bytes(pieces, scan(Scanner(robot, wall, generator(4)), 8.0))
-
-
-@given(rate=st.floats(0.01, 500), reading=st.floats(1, 500), count=st.integers(1, 500))
-def test_a_held_sample_is_never_from_the_future_and_is_the_latest(rate, reading, count):
-    t = np.arange(count) / reading
-    stamps, latest = held(t, rate)
-    assert np.all(stamps[latest] <= t)
-    assert np.all((np.arange(len(stamps) + 1) / rate)[latest + 1] > t)
-    assert_allclose(np.diff(stamps), 1 / rate, rtol=1e-9)
 
 
 @given(
