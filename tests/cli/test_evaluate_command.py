@@ -3,7 +3,6 @@
 import json
 import re
 
-import numpy as np
 import pytest
 from learn_drives import HILLS, a_drive, hills
 from places import DOCS
@@ -11,9 +10,7 @@ from places import DOCS
 from magtwin.cli import main
 from magtwin.files.file import sha256
 from magtwin.io.formats import write_run
-from magtwin.io.provenance import made_again
 from magtwin.learn.data.dataset import build_dataset
-from magtwin.run.compare import traversals
 from magtwin.twin import in_session_of, open_twin, simulate
 from magtwin.usd.maps.layer import save_map
 
@@ -163,17 +160,3 @@ def test_the_example_of_the_docs_runs(room, tmp_path, monkeypatch, capsys):
     exec(page.split("```python")[1].split("```")[0], {})
     ratio, low, high = map(float, re.findall(r"[\d.]+", capsys.readouterr().out.splitlines()[-1]))
     assert low <= ratio <= high
-
-
-def test_two_drives_of_one_path_lie_over_each_other_once_they_are_aligned(lab_scene):
-    twin = open_twin(lab_scene, magnetometer="physical", tracking_error=False)
-    a = simulate(twin, "figure8", seed=0, duration_s=30.0, rate_hz=20.0)
-    faster = simulate(twin, "figure8", seed=1, speed=0.25, duration_s=25.0, rate_hz=20.0)
-    again = made_again(a, lab_scene, engine="kinematic", seed=1)
-    both, speeds = traversals(a, again), traversals(a, faster)
-    field = {how: getattr(both, how).fields["b_truth_nt"] for how in ("recorded", "placed")}
-    apart = {how: np.abs(np.subtract(*pair)).mean() for how, pair in field.items()}
-    assert apart["placed"] < 40  # wheels of another seed, motors and all
-    drift = {how: np.abs(np.subtract(*getattr(speeds, how).fields["b_truth_nt"])).mean()
-             for how in ("recorded", "placed")}  # fmt: skip
-    assert drift["recorded"] > 5 * drift["placed"]  # as in the paper's Figure 8

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from magtwin.cli import main
-from magtwin.report.summary import in_markdown, printable_lines
 from magtwin.run.run import Column, Run
 
 EVIL = "a\x1b]0;owned\x07\x1b[31mb\u202ec\x9b2Jd\x7f<script>alert(1)</script>"
@@ -88,8 +87,3 @@ def test_pages_hold_no_markup_of_a_file(files, tmp_path, capsys):
     text = page.read_text(encoding="utf-8")
     assert "<script>alert" not in text
     assert not set(text) & set(HARMFUL)
-
-
-def test_markdown_and_lines_keep_plain_text():
-    assert printable_lines("plain text, x_y\n\tmore: µT") == "plain text, x_y\n\tmore: µT"
-    assert in_markdown("a|b <i> [x](y) `c`") == r"a\|b \<i\> \[x\](y) \`c\`"

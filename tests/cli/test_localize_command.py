@@ -15,7 +15,6 @@ from magtwin.files.file import shipped
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.localization.readings import onboard
-from magtwin.localization.scores import Scores, verdict_of
 from magtwin.tasks.localizing import localization, prior_of, thinned
 
 
@@ -220,36 +219,3 @@ def test_a_prior_is_drawn_about_the_truth_with_the_spread_that_it_states(here: P
     assert all(prior.is_global for prior in headings)
     assert prior_of(run, "global").sd == (np.inf,) * 3
     assert prior_of(run, "1,-2,0.5").mean == (1.0, -2.0, 0.5)
-
-
-@pytest.mark.parametrize(
-    ("scores", "said"),
-    [
-        (
-            Scores(rmse_m=0.05, anees=1.1, anees_low=0.8, anees_high=1.3, converged_s=0.0, lost_share=0.0),
-            "Better than dead reckoning: 5.0 cm RMSE against 20.0 cm, 75% less. Consistent: ANEES 1.10 per "
-            "state. Not lost.",
-        ),
-        (
-            Scores(
-                rmse_m=0.8, anees=2.0, anees_low=0.8, anees_high=1.3, diverged=True, diverged_unflagged=True
-            ),
-            "WORSE than dead reckoning: 80.0 cm RMSE against 20.0 cm. TOO CONFIDENT: ANEES 2.00 per state, "
-            "at most 1.30 expected. LOST: its error stayed above 0.5 m for more than 5 s.",
-        ),
-        (
-            Scores(rmse_m=0.2, anees=0.2, anees_low=0.8, anees_high=1.3, converged_s=3.0, lost_share=0.1),
-            "No better than dead reckoning: 20.0 cm RMSE against 20.0 cm. Too cautious: ANEES 0.20 per "
-            "state, at least 0.80 expected. Not lost, but flagged so in 10% of the readings.",
-        ),
-    ],
-)
-def test_a_verdict_says_whether_it_is_better_consistent_and_lost(scores: Scores, said: str) -> None:
-    assert verdict_of(scores, 0.2) == said
-
-
-@pytest.mark.parametrize("name", ["random.py", "my-filter.py", "class.py"])
-def test_a_localizer_has_the_name_of_a_module(tmp_path: Path, name: str) -> None:
-    with pytest.raises(SystemExit):
-        main(["new", str(tmp_path / name)])
-    assert not list(tmp_path.iterdir())

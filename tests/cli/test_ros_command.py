@@ -105,9 +105,3 @@ def test_what_cannot_be_is_one_line(
     arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert said in refused(arguments, capsys)
-
-
-def test_what_exists_is_not_recorded_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "bag").mkdir()
-    said = refused(["record", str(tmp_path / "bag"), "--duration-s", "0.1"], capsys)
-    assert "--force" in said

@@ -216,20 +216,6 @@ def test_the_configuration_of_any_kind_repeats_its_weights_to_the_byte(data, kin
     assert again.read_bytes() == kinds[kind][0].read_bytes()
 
 
-def test_a_model_that_is_fitted_at_once_has_no_learning_curve(kinds):
-    beside = sorted(path.name for path in kinds["linear"][0].parent.glob("linear.*"))
-    assert beside == ["linear.md", "linear.safetensors"]
-    assert kinds["hybrid"][0].with_suffix(".png").exists()
-
-
-def test_a_hybrid_says_whether_its_network_was_kept_and_both_figures(kinds):
-    out, printed = kinds["hybrid"]
-    hybrid, figures = load_predictor(out), printed["figures"]
-    base, whole = (figures[name]["value"] for name in ("base alone MAE", "with network MAE"))
-    assert (hybrid.net is not None) == (whole < base) == (figures["network"]["value"] == "kept")
-    assert f"the base alone errs by {base:.1f} nT, with the network by {whole:.1f} nT" in card_of(out)
-
-
 @pytest.mark.parametrize("bent", [True, False])
 def test_a_hybrid_keeps_its_network_only_where_the_base_leaves_something(tmp_path, bent):
     runs = {name: a_run(i, "eight") for i, name in enumerate("abcdefg")}
