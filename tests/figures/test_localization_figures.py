@@ -87,15 +87,6 @@ def test_lost_readings_are_shaded_and_their_estimates_left_out(result: Localizat
     assert "flagged lost" in [text.get_text() for text in position.get_legend().get_texts()]
 
 
-def test_without_a_truth_and_a_map_the_estimate_is_drawn_alone(result: Localization) -> None:
-    run = result.run.select("t", "odom_p", "odom_q_xyzw", "b_measured_nt")
-    alone = localization(run, None, method="odometry", prior="0,0,0.5")
-    floor, position = draw_localization(alone).axes[:2]
-    names = [text.get_text() for text in floor.get_legend().get_texts()]
-    assert names == ["dead reckoning", "estimate", "its 2-sigma ellipse", "start"]
-    assert [text.get_text() for text in position.get_legend().get_texts()] == ["2 sigma"]
-
-
 def test_an_ellipse_lies_two_standard_deviations_away() -> None:
     covariance = np.array([[0.04, 0.012], [0.012, 0.01]])
     away = ellipse(np.array([1.0, 2.0]), covariance) - (1.0, 2.0)

@@ -11,7 +11,6 @@ from numpy.testing import assert_allclose
 
 from magtwin.errors import InputError, UnknownNameError
 from magtwin.path import (
-    CASES,
     PATHS,
     Path,
     check_clear,
@@ -98,13 +97,6 @@ def test_a_closed_path_is_prolonged_by_laps_and_an_open_one_back_and_forth():
     assert_allclose(laps.at(np.arange(18.0)), loop.at(np.arange(18.0)), atol=1e-9)
     assert_allclose(line.prolonged(2.5).p_xy[:, 0], [0, 1, 0, 1])
     assert_allclose(line.prolonged(0.1).p_xy, line.p_xy)
-
-
-@pytest.mark.parametrize("name", PATHS)
-def test_every_named_path_fits_the_default_floor_and_bears_its_name(name):
-    path = path_named(name)
-    check_on_floor(path, FLOOR, FOOTPRINT)
-    assert path.name == name
 
 
 def test_the_sine_is_equation_7():
@@ -241,16 +233,6 @@ def test_a_csv_of_a_spreadsheet_is_read_with_a_note(tmp_path, text, note, recwar
         assert re.search(rf"p\.csv: read {note}", str(recwarn.pop().message))
 
 
-def test_a_csv_that_is_not_text_or_not_there_is_refused(tmp_path):
-    (tmp_path / "p.csv").write_bytes(b"\x89PNG\x00\x80")
-    with pytest.raises(InputError, match=r"p\.csv: not a text file"):
-        read_path_csv(tmp_path / "p.csv")
-    with pytest.raises(InputError, match=r"q\.csv: no such path file$"):
-        read_path_csv(tmp_path / "q.csv")
-    with pytest.raises(InputError, match=r"cannot be read \(a folder\); expected a path file"):
-        read_path_csv(tmp_path)
-
-
 def test_resolve_takes_a_name_or_a_file_and_names_the_near_one(tmp_path):
     file = tmp_path / "p.csv"
     file.write_text("0,0\n1,2\n")
@@ -296,23 +278,6 @@ def test_points_that_are_no_path_are_refused(points, says):
 def test_a_path_of_no_size_that_could_be_driven_is_refused(make, says):
     with pytest.raises(InputError, match=says):
         make()
-
-
-def test_smooth_named_paths_can_be_driven_at_a_fifth_of_a_metre_a_second():
-    # k v < w_max of the drive; the narrow figure's ends, of radius 4 b^2 / a = 0.15 m, are tightest.
-    for name in ("sine", "figure8", "curvilinear", "narrow_figure8"):
-        path = path_named(name)
-        s = np.linspace(0.05, path.length - 0.05, 4000)
-        assert np.abs(path.curvature(s)).max() < 1.9 / 0.2, name
-    narrow = path_named("narrow_figure8")
-    ends = np.abs(narrow.curvature(narrow.length * np.array([0.25, 0.75])))
-    assert_allclose(ends, 2.4 / (4 * 0.3**2), rtol=0.03)  # its points are 5 mm apart
-
-
-def test_a_case_of_table_1_is_a_named_path():
-    assert {case: path_named(case).name for case in CASES} == dict(CASES)
-    assert list(CASES) == list("ABCDE")
-    assert resolve_path("A").name == "fast_sine"
 
 
 def test_the_fast_sine_is_the_released_one(real_data):

@@ -63,11 +63,6 @@ def test_a_named_path_passes_what_stands_in_its_way(name, where):
     assert len(path.p_xy) == len(path_named(name).p_xy)
 
 
-def test_a_path_that_fits_is_not_touched_by_a_fit():
-    path = Path("own", np.array([[0.0, 0.0], [1.0, 1.0]]))
-    assert fit_path(path, room(4.0, 3.0)) is path
-
-
 def test_a_fit_keeps_the_shape_and_only_moves_what_is_small_enough():
     square = Path("own", np.array([[1.0, 1.0], [3.0, 1.0], [3.0, 2.0], [1.0, 2.0]]), closed=True)
     moved = fit_path(square, room(4.0, 3.0))
@@ -97,13 +92,6 @@ def test_a_path_that_does_not_fit_is_told_what_would(points, said):
     with pytest.raises(InputError, match=said):
         check_on_floor(path, (4.0, 3.0), RADIUS_M)
     check_on_floor(fit_path(path, room(4.0, 3.0)), (4.0, 3.0), RADIUS_M)
-
-
-def test_what_the_refusal_says_is_true():
-    path = Path("own", np.array([[0.0, 0.0], [3.0, 0.0]]))
-    check_on_floor(path.placed((1.0, 1.0, -1.1711, 0.0)), (4.0, 3.0), RADIUS_M)
-    path = Path("own", np.array([[-3.0, 0.0], [3.0, 0.0]]))
-    check_on_floor(path.placed((0.6, 0.6, 0.0, 0.0)), (4.0, 3.0), RADIUS_M)
 
 
 def test_no_room_is_refused():
