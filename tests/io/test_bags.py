@@ -84,11 +84,6 @@ def assert_same(back, run, *, unit="T"):
             assert_array_equal(back[name], run[name], err_msg=name)
 
 
-@pytest.mark.parametrize("name", [*KINDS, "run.db3"])
-def test_a_run_comes_back_from_a_bag(bags, made, name):
-    assert_same(read_bag(bags / name), made[0])
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32), st.integers(0, 60), st.integers(1, 60))
 def test_any_run_in_blocks_of_any_size_comes_back_to_the_last_bit(tmp_path_factory, seed, rows, block):
@@ -117,15 +112,6 @@ def test_any_run_in_blocks_of_any_size_comes_back_to_the_last_bit(tmp_path_facto
         assert a[~gone].tobytes() == b[~gone].tobytes(), name
 
 
-def test_a_unit_for_a_bag_that_says_its_own_is_refused(bags):
-    with pytest.raises(InputError, match="holds its unit; drop 'uT'"):
-        read_bag(bags / "run.mcap", unit="uT")
-
-
-def test_fields_in_nt_come_back_to_the_last_bit(bags, made):
-    assert_same(read_bag(bags / "nt.mcap"), made[0], unit="nT")
-
-
 def messages(path):
     """By topic the times and messages that rosbags reads."""
     found = {}
@@ -134,15 +120,6 @@ def messages(path):
             found.setdefault(connection.topic, []).append(
                 (t, STORE.deserialize_cdr(data, connection.msgtype))
             )
-    return found
-
-
-def raw(path):
-    """By topic the times and bytes of the messages that rosbags finds."""
-    found = {}
-    with Reader(path) as reader:
-        for connection, t, data in reader.messages():
-            found.setdefault(connection.topic, []).append((t, bytes(data)))
     return found
 
 
@@ -289,12 +266,6 @@ def test_a_robot_with_its_urdf_beside_it_is_described(made, tmp_path):
     assert parents["base_footprint"] == "base_link"
 
 
-def test_a_run_without_rows_comes_back_without(made, tmp_path):
-    none = made[0].take(slice(0))
-    write_bag(none, tmp_path / "run.mcap")
-    assert_same(read_bag(tmp_path / "run.mcap"), none)
-
-
 def test_what_no_bag_can_hold_is_refused_and_what_was_there_stays(made, tmp_path):
     run, target = made[0], tmp_path / "run.mcap"
     target.write_bytes(b"earlier")
@@ -324,14 +295,6 @@ def test_what_no_bag_can_hold_is_refused_and_what_was_there_stays(made, tmp_path
             InputError, match=r"a bag is a folder, .* that ends in \.mcap; ros2 bag convert makes"
         ):
             write_bag(run, tmp_path / name)
-
-
-@pytest.mark.parametrize("name", KINDS)
-def test_a_run_in_blocks_says_what_the_whole_run_says(made, twin, bags, tmp_path, name, monkeypatch):
-    monkeypatch.setattr("magtwin.io.bags.writer.BLOCK", 101)
-    write_bag(made[0], tmp_path / name, twin, scans=made[1])
-    assert_same(read_bag(tmp_path / name), made[0])
-    assert raw(tmp_path / name) == raw(bags / name)
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -64,14 +64,6 @@ def test_a_changed_file_is_refused_and_nothing_is_left(mirror, table, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["mirror"]
 
 
-def test_a_missing_file_is_refused_and_nothing_is_left(mirror, table, tmp_path):
-    _, url = mirror
-    table(a=b"alpha")
-    with pytest.raises(InputError, match=r"data/a: could not be fetched \(404"):
-        fetch("tiny", tmp_path / "out", base_url=url)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["mirror"]
-
-
 def test_a_folder_that_exists_is_not_overwritten_unasked(table, tmp_path):
     table(a=b"alpha")
     with pytest.raises(InputError, match="exists already"):
@@ -81,11 +73,6 @@ def test_a_folder_that_exists_is_not_overwritten_unasked(table, tmp_path):
 def test_a_misspelt_source_is_refused_by_the_near_name(tmp_path):
     with pytest.raises(InputError, match="did you mean 'aprilab'"):
         fetch("april", tmp_path / "out")
-
-
-def test_only_web_addresses_are_fetched_from(tmp_path):
-    with pytest.raises(InputError, match="must begin with http"):
-        fetch("aprilab", tmp_path / "out", base_url="file:///etc")
 
 
 def test_the_tables_agree_with_the_real_files(real_data):

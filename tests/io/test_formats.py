@@ -107,17 +107,6 @@ def test_folders_are_read_by_what_is_in_them(run, written, tmp_path):
         read_run(tmp_path / "none")
 
 
-def test_options_of_another_format_and_unknown_endings_are_refused(run, tmp_path):
-    with pytest.raises(InputError, match="Parquet has no option 'units'; drop it"):
-        write_run(run, tmp_path / "run.parquet", units="nT")
-    with pytest.raises(InputError, match=r"run\.parqet: unknown format of a run; did you mean '\.parquet'"):
-        write_run(run, tmp_path / "run.parqet")
-    (tmp_path / "run.csv").touch()
-    with pytest.raises(InputError, match=r"no such run; did you mean 'run\.csv'"):
-        read_run(tmp_path / "rum.csv")
-    assert [p.name for p in tmp_path.iterdir()] == ["run.csv"]
-
-
 @pytest.mark.parametrize("name", [f"run{suffix}" for suffix, kind in FORMATS.items() if kind.write])
 def test_every_format_refuses_a_file_cut_short_or_of_another_kind(name, written, tmp_path):
     whole = (written / name).read_bytes()

@@ -5,9 +5,7 @@ import json
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from recordings import record
 from refusing import refused
-from test_recorded import poses, readings
 from test_stuck import gridded
 
 from magtwin.author.earth import earth_of
@@ -88,13 +86,6 @@ def test_a_table_becomes_a_file_of_readings_by_its_column_names(tmp_path, capsys
     assert_allclose(readings.yaw, np.radians([10, 20]))
 
 
-def test_a_bag_becomes_readings_by_the_command(tmp_path, capsys):
-    bag = record(tmp_path / "bag", {"/pose": poses(), "/slam": poses(), "/mag": readings()})
-    run("map", "import", bag, "--out", tmp_path / "a.parquet", "--pose-topic", "/pose")
-    assert "field /mag" in capsys.readouterr().out
-    assert len(load_readings(tmp_path / "a.parquet")) == 198
-
-
 def test_scattered_readings_make_no_nodes_and_the_way_on_is_told(tmp_path, capsys):
     (tmp_path / "a.csv").write_text("x,y,yaw,field\n0,0,0,41000\n1,0,0,41500\n")
     line = refused(capsys, "map", "import", tmp_path / "a.csv", "--out", tmp_path / "a.usdc")
@@ -155,21 +146,6 @@ def test_repeats_of_a_fast_logger_are_counted_and_a_fit_that_lacks_readings_name
     assert "5 of 60 readings are good, 55 are masked as stuck (--keep-stuck keeps them)" in line
 
 
-@pytest.mark.parametrize("headings", ["", "north", "0,nan", "0;90"])
-def test_headings_that_are_none_are_refused(tmp_path, capsys, headings):
-    save_readings(gridded(0), tmp_path / "a.parquet")
-    arguments = (
-        "map",
-        "fit",
-        tmp_path / "a.parquet",
-        "--out",
-        tmp_path / "a.usdc",
-        "--headings-deg",
-        headings,
-    )
-    assert "headings are degrees with commas between" in refused(capsys, *arguments)
-
-
 @pytest.mark.parametrize(
     ("text", "flags"),
     [
@@ -183,20 +159,6 @@ def test_a_fit_of_a_table_that_must_be_told_names_the_import_to_type(tmp_path, c
     (tmp_path / "a b.csv").write_text(text)
     line = refused(capsys, "map", "fit", tmp_path / "a b.csv", "--out", tmp_path / "m.usdc")
     assert line.endswith(f"magtwin map import '{tmp_path}/a b.csv' {flags} --out 'a b.parquet'")
-
-
-@pytest.mark.parametrize(
-    ("said", "why"),
-    [
-        (("--created", "yesterday"), "--created must be a day YYYY-MM-DD, got 'yesterday'"),
-        (("--height-m", "-1"), "--height-m of Readings is a height above the floor, 0 m or more, got -1.0"),
-        (("--height-m", "nan"), "--height-m of Readings is a height above the floor, 0 m or more, got nan"),
-    ],
-)
-def test_a_day_or_a_height_that_is_none_is_refused(tmp_path, capsys, real_data, said, why):
-    maps = real_data / "aprilab/maps"
-    assert why in refused(capsys, "map", "import", maps, "--out", tmp_path / "a.usdc", *said)
-    assert not (tmp_path / "a.usdc").exists()
 
 
 def test_the_earths_field_is_taken_from_a_place_and_day_as_numbers_or_from_a_scene(lab_scene):
@@ -235,29 +197,6 @@ def test_an_option_of_another_method_and_a_field_that_is_none_are_refused(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_fit_of_one_heading_and_of_few_readings_says_that_they_are_doubtful(tmp_path, capsys):
-    rows = "".join(f"{x},{y},0.5,{41 + 0.1 * x * y:.3f}\n" for x in range(4) for y in range(4))
-    (tmp_path / "hall.csv").write_text("x,y,heading,field\n" + rows)
-    run(
-        "map",
-        "fit",
-        tmp_path / "hall.csv",
-        "--method",
-        "gp",
-        "--spacing-m",
-        "0.5",
-        "--out",
-        tmp_path / "z.usdc",
-    )
-    said = " ".join(capsys.readouterr().out.split())
-    assert "only 16 good readings" in said
-    assert (
-        "one heading only, 29 deg: unless the sensor was carried by hand, the robot's own field cannot"
-        in said
-    )
-    assert "field in uT, by its size (--unit)" in said
-
-
 def test_vectors_and_headings_that_contradict_each_other_are_a_doubt(tmp_path, capsys):
     rng = np.random.default_rng(0)
     yaw, b = rng.uniform(-3, 3, 40), 20 * np.exp(1j * rng.uniform(-3, 3, 40))
@@ -270,11 +209,3 @@ def test_vectors_and_headings_that_contradict_each_other_are_a_doubt(tmp_path, c
     assert doubt.startswith("vectors keep no direction in world axes (")
     (fitted,) = vector_doubts(load_readings(tmp_path / "a.parquet"))
     assert fitted == doubt
-
-
-def test_too_few_readings_are_no_map(tmp_path, capsys):
-    rows = "".join(f"{x},{x % 2},{x},41000\n" for x in range(7))
-    (tmp_path / "hall.csv").write_text("x,y,heading,field\n" + rows)
-    with pytest.raises(SystemExit):
-        run("map", "fit", tmp_path / "hall.csv", "--out", tmp_path / "z.usdc")
-    assert "hall.csv: 7 of 7 readings are good; a map needs 8 at least" in capsys.readouterr().err

@@ -245,10 +245,3 @@ def test_a_missing_column_and_missing_rows_count_as_differences():
     (lost,) = differences(a, Run({"t": np.arange(4.0)}))
     assert (lost.column, lost.rows) == ("battery_v", 4)
     assert differences(a, a) == ()
-
-
-def test_zeros_of_other_sign_and_nan_beside_a_number_differ_and_nan_beside_nan_does_not():
-    a = Run({"t": [0.0, 1.0, 2.0, 3.0], "yaw": [0.0, np.nan, np.nan, 1.0]})
-    b = Run({"t": [0.0, 1.0, 2.0, 3.0], "yaw": [-0.0, np.nan, 1.0, 1.0]})
-    (yaw,) = differences(a, b)
-    assert (yaw.column, yaw.rows, yaw.first) == ("yaw", 2, 0)

@@ -299,14 +299,6 @@ def test_a_vector_beside_the_magnitude_has_a_unit_of_its_own(tmp_path):
     assert (run.metadata["field_unit"], run.metadata["vector_unit"]) == ("nT", "T")
 
 
-def test_plain_numbers_are_taken_as_received(tmp_path):
-    plain = said(at(50), lambda k, t: ("std_msgs/msg/Float64", {"data": 41_000.0}))
-    bag = record(tmp_path / "a.mcap", {"/mag": plain, "/temperature": plain, POSE: poses()})
-    run = read_bag(bag)
-    assert (run.metadata["stamps"], run.metadata["clock"]) == ("receipt", "/mag")
-    assert_allclose(run["mocap_p"][:, 0], 0.2 * np.floor(run["t"] * 20 + 1e-6) / 20, atol=1e-9)
-
-
 def test_a_simulation_that_begins_at_0_has_stamps(tmp_path):
     def early(said):
         return [
@@ -499,32 +491,3 @@ def test_metadata_that_is_none_or_points_outside_its_folder_reaches_nothing_and_
             read_bag(bag)
         assert "\n" not in str(refusal.value)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bag", "bag_0.mcap"]
-
-
-@pytest.mark.parametrize("storage", ["mcap", "db3"])
-@pytest.mark.parametrize("keep", [0.0, 0.01, 0.5, 0.8])
-def test_a_bag_that_was_cut_short_is_refused_in_one_line(tmp_path, storage, keep):
-    file = record(tmp_path / "a.mcap", BASE)
-    file = file if storage == "mcap" else as_db3(file, tmp_path / "a.db3")
-    content = file.read_bytes()
-    file.write_bytes(content[: int(keep * len(content))])
-    with pytest.raises(InputError, match=r"a\.\w+: (damaged bag, or none|cut short)") as refusal:
-        read_bag(file)
-    assert "\n" not in str(refusal.value)
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"unit": "T", "scale": 5.0}, "give either the unit of the field or its scale"),
-        ({"scale": 0.0}, "must be above 0, got 0"),
-        ({"scale": np.nan}, "must be above 0, got nan"),
-    ],
-)
-def test_a_factor_that_is_none_or_one_of_two_is_refused_in_a_recording_and_in_a_survey(
-    tmp_path, options, text
-):
-    bag = record(tmp_path / "bag", BASE)
-    for read in (lambda: read_bag(bag, **options), lambda: Columns(**options)):
-        with pytest.raises(InputError, match=text):
-            read()

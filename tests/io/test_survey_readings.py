@@ -163,20 +163,6 @@ def test_columns_are_found_by_usual_names_whatever_wrote_them(tmp_path, header):
 
 
 @pytest.mark.parametrize(
-    ("x", "note"),
-    [
-        ((-150, 150), "over 300 m: if these are cm"),
-        ((-82.35, -82.35004), "over 0.04 mm only: if these are degrees"),
-        ((-2, 2), ""),
-    ],
-)
-def test_positions_of_an_unlikely_size_have_a_note(tmp_path, x, note):
-    text = "x,y,yaw,b\n" + "".join(f"{v},29.65,0,41000\n" for v in x)
-    assert note in "".join(taken(read_readings(file(tmp_path, text))))
-    assert not taken(read_readings(file(tmp_path, text.replace("x,", "x [m],"), "b.csv")))
-
-
-@pytest.mark.parametrize(
     ("header", "nt"),
     [
         (
@@ -438,18 +424,6 @@ def test_damaged_metadata_is_refused(tmp_path, change):
         read_readings(tmp_path / "b.parquet")
 
 
-def test_readings_whose_columns_do_not_fit_are_refused_with_the_file(tmp_path):
-    save_readings(read_readings(file(tmp_path, ROWS)), tmp_path / "a.parquet")
-    table = pq.read_table(tmp_path / "a.parquet")
-    wrong = table.set_column(table.column_names.index("b_nt"), "b_nt", [[-1.0, 2.0, 3.0]])
-    pq.write_table(wrong, tmp_path / "b.parquet")
-    with pytest.raises(InputError, match=r"b\.parquet: b_nt of Readings is a magnitude"):
-        load_readings(tmp_path / "b.parquet")
-    pq.write_table(table.drop_columns(["yaw"]), tmp_path / "c.parquet")
-    with pytest.raises(InputError, match=r"c\.parquet: no column 'yaw'"):
-        load_readings(tmp_path / "c.parquet")
-
-
 REFUSALS = {
     "x in no length": ("x [px],y,yaw,b\n0,0,0,41000\n", {}, r"a\.csv: 'x \[px\]' is in no unit of x"),
     "no unit fits": ("x,y,yaw,field\n0,0,0,3\n", {}, r"a\.csv: the median of field is 3 nT, .*no usual unit"),
@@ -537,30 +511,6 @@ def test_a_table_that_makes_no_readings_is_refused(tmp_path, case):
         read_readings(tmp_path / "a.csv", columns=Columns(**options))
 
 
-@pytest.mark.parametrize(
-    ("options", "what"),
-    [
-        ({"vector": "bx,by"}, "vector takes 3 columns with commas between, got 'bx,by'"),
-        ({"quaternion": "q"}, "quaternion takes 4 columns"),
-        (
-            {"quaternion": "a,b,c,d", "heading": "yaw"},
-            "give either the heading's column or the quaternion's",
-        ),
-    ],
-)
-def test_columns_that_cannot_be_are_refused_at_birth(options, what):
-    with pytest.raises(InputError, match=what):
-        Columns(**options)
-
-
-def test_columns_are_refused_for_sources_whose_columns_are_known(tmp_path):
-    save_readings(read_readings(file(tmp_path, ROWS)), tmp_path / "a.parquet")
-    (tmp_path / "maps").mkdir()
-    for source in ("a.parquet", "maps"):
-        with pytest.raises(InputError, match="its columns are known; drop the options"):
-            read_readings(tmp_path / source, columns=Columns(x="px"))
-
-
 def test_a_gridded_survey_is_not_one_of_several_sources(tmp_path, real_data):
     with pytest.raises(InputError, match="survey 'maps' is gridded and cannot be one of several sources"):
         read_readings(real_data / "aprilab/maps", file(tmp_path, ROWS))
@@ -633,11 +583,3 @@ def test_a_pattern_stands_for_the_files_that_match_it_in_the_order_of_their_name
     assert same(read_readings("drive_?.csv"), want)
     with pytest.raises(InputError, match=r"^no file or folder matches 'nowhere/\*\.csv'; check the pattern$"):
         read_readings("nowhere/*.csv")
-
-
-def test_a_folder_of_parquet_files_is_several_runs(tmp_path):
-    for name in ("b", "a"):
-        readings = read_readings(file(tmp_path, ROWS, f"{name}.csv"))
-        (tmp_path / "runs").mkdir(exist_ok=True)
-        save_readings(readings, tmp_path / "runs" / f"{name}.parquet")
-    assert read_readings(tmp_path / "runs").runs == ("a", "b")
