@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from refusing import refused
 
 from magtwin.cli import main
 from magtwin.field.grid import Grid
@@ -61,15 +62,6 @@ def told(capsys, *arguments):
     """What a command says as JSON."""
     main([*map(str, arguments), "--json"])
     return json.loads(capsys.readouterr().out)
-
-
-def refused(capsys, *arguments):
-    with pytest.raises(SystemExit) as stop:
-        main(list(map(str, arguments)))
-    assert stop.value.code == 1
-    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("  ")]
-    assert len(lines) == 1
-    return lines[0]
 
 
 def test_info_tells_everything_that_a_map_knows(layer, capsys):

@@ -40,43 +40,21 @@ TAKES = {
 }
 """What the refusal of each file names."""
 
-RARE = {
-    "run.csv",
-    "cart",
-    "controllers.yaml",
-    "floor.yaml",
-    "metadata.yaml",
-    "mesh.stl",
-    "world.sdf",
-    "data.zip",
-    "drive.bag",
-}
+RARE = {"run.csv", "cart", "controllers.yaml", "floor.yaml", "metadata.yaml", "mesh.stl", "world.sdf"}
+RARE |= {"data.zip", "drive.bag"}
 """Files that are tried with a few commands only: what they are decides, not the command."""
 
-FEW = (
-    "run FILE",
-    "scene FILE --out new",
-    "robot FILE --out new",
-    "info FILE",
-    "map import FILE --out new.parquet",
-)
+FEW = ("run FILE", "scene FILE --out new", "robot FILE --out new", "info FILE")
 """Those commands."""
 
 RUNS = {"run.npz", "run.parquet", "run.csv", "map.usdc", "model.json"}
 """Files that a reader of runs opens: stages and JSON may hold one."""
 
+TABLES = {"run.npz", "run.parquet", "run.csv", "commands.csv", "path.csv"}
 SLOTS = {
     "run FILE": {"map.usdc", "room", "cart"},
     "sweep FILE --out new": {"map.usdc", "room", "cart"},
-    "map import FILE --out new.parquet": {
-        "run.npz",
-        "run.parquet",
-        "run.csv",
-        "survey",
-        "drives",
-        "commands.csv",
-        "path.csv",
-    },
+    "map import FILE --out new.parquet": TABLES | {"survey", "drives"},
     "map survey FILE --out new.usdc": {"map.usdc", "room", "cart"},
     "export FILE --out new": {"map.usdc", "room", "cart"},
     "run lab --path FILE --out new": RUNS | {"path.csv", "commands.csv"},

@@ -65,13 +65,6 @@ def card_of(weights):
     return " ".join(weights.with_suffix(".md").read_text().split())
 
 
-def refused(capsys, *words):
-    with pytest.raises(SystemExit) as ended:
-        main([str(word) for word in words])
-    assert ended.value.code == 1
-    return capsys.readouterr().err.splitlines()[-1]
-
-
 def test_the_card_tells_checksum_errors_by_path_and_how_to_repeat(trained):
     card = trained.with_suffix(".md").read_text()
     assert sha256(trained) in card
@@ -267,15 +260,15 @@ def test_a_gpu_that_is_not_there_is_refused_and_auto_takes_the_cpu(data, kinds):
         (["--out", "DATA/f.onnx"], "a network ends in .safetensors"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_trained_is_refused_and_writes_nothing(data, kinds, tmp_path, capsys, words, text):
+def test_what_cannot_be_trained_is_refused_and_writes_nothing(data, kinds, tmp_path, refusal, words, text):
     folders = {"KINDS": str(kinds["linear"][0].parent), "DATA": str(data)}
     words = [re.sub("^(KINDS|DATA)", lambda found: folders[found[1]], word) for word in words]
     out = [] if "--out" in words else ["--out", str(tmp_path / "f.safetensors")]
-    assert text in refused(capsys, "train", data, *out, *words)
+    assert text in refusal("train", data, *out, *words)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_files_beside_the_weights_are_not_written_over(data, tmp_path, capsys):
+def test_files_beside_the_weights_are_not_written_over(data, tmp_path, refusal):
     (tmp_path / "f.png").write_text("mine")
-    said = refused(capsys, "train", data, "--out", tmp_path / "f.safetensors")
+    said = refusal("train", data, "--out", tmp_path / "f.safetensors")
     assert "f.png: exists already; give --force" in said

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from rooms import EARTH, scene_of
 
 from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.sim.interference import (
@@ -21,19 +22,11 @@ from magtwin.sim.interference import (
 from magtwin.sim.motion.drive import Motion
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.furniture import FurnitureSpec
-from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
+from magtwin.spec.magnetics import PlatformFieldSpec, SourceSpec
 from magtwin.spec.robot import RobotSpec
-from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import BatterySpec
 
-EARTH = EarthFieldSpec(
-    b_world_nt=(-2_745.6, 24_067.1, -38_418.4),
-    latitude_deg=29.65,
-    longitude_deg=-82.35,
-    height_m=50.0,
-    date="2026-11-21",
-)
-SCENE = Scene(name="hall", map_layer=Path("hall.usdc"), robot=RobotSpec(name="r", asset=Path("r.usda")))
+SCENE = scene_of(RobotSpec(name="r", asset=Path("r.usda")))
 QUIET = {
     "b_rate": np.zeros((4, 3)),
     "motor_nm": np.zeros((4, 2)),

@@ -28,6 +28,7 @@ from magtwin.twin import open_twin, simulate
 from magtwin.twin.twin import without_tracking_error
 
 DRIVE = DriveSpec()
+NS = 1_700_000_000_000_000_000
 
 
 def test_a_run_that_is_replayed_has_the_poses_of_the_run_to_the_last_bit(twin):
@@ -99,11 +100,9 @@ def test_a_run_that_cannot_be_replayed_is_refused(t, x, what):
         ("t [ms],v [mm/s],w [deg/s]\n0,100,0\n500,200,90\n", "by the units in their names"),
         ("t_ms,v_mps,yaw_rate_dps\n0,.1,0\n500,.2,90\n", "t_ms, v_mps and yaw_rate_dps as t, v and w"),
         ("angular.z,linear.x,linear.y,time\n0,.1,0,0\n%r,.2,0,.5\n" % (np.pi / 2), "left out linear.y"),
-        ("t,v,w [\u00b0/s]\n1.7e9,.1,0\n1700000000.5,.2,90\n", "times as counted from the first line"),
-        (
-            "%%time,v,w\n1700000000000000000,.1,0\n1700000000500000000,.2,%r\n" % (np.pi / 2),
-            "in ns since 1970, by its size",
-        ),
+        ("t,v,w [\u00b0/s]\n1.7e9,.1,0\n1700000000.5,.2,90\n", "counted from the first line"),
+        (f"%time,v,w\n{NS},.1,0\n{NS + 500_000_000},.2,{np.pi / 2}\n", "in ns since 1970"),
+        (";w [deg/s];v;t\n0;0,0;0,1;0,0\n1;90,0;0,2;0,5\n", "decimal commas"),
     ],
 )
 def test_commands_are_read_by_their_names_and_units_and_from_any_clock(tmp_path, text, note):
@@ -114,26 +113,23 @@ def test_commands_are_read_by_their_names_and_units_and_from_any_clock(tmp_path,
 
 
 @pytest.mark.parametrize(
-    ("text", "what"),
+    ("text", "words"),
     [
-        (
-            "t,left,right\n0,1,1\n",
-            "no column of v in 't,left,right'; wheel speeds .* are not read; name time",
-        ),
-        ("t,v,steering\n0,1,1\n", "no column of w in 't,v,steering'"),
-        ("t,v [knots],w\n0,1,1\n", r"'v \[knots\]' is in no unit of v; known: cm/s, km/h, m/s, mm/s"),
+        ("t,left,right\n0,1,1\n", "no column of v .*wheel speeds"),
+        ("t,v,steering\n0,1,1\n", "no column of w"),
+        ("t,v [knots],w\n0,1,1\n", "in no unit of v"),
         ("t,v,w,w\n0,1,1,1\n", "2 columns are called 'w'"),
         ("t,v,w\n0,0.1,0\n0.5,0.1,0\n0.4,0.1,0\n", ":4: times must ascend"),
         ("0,nan,0\n", ":1: a command is three finite numbers"),
         ("0,0.1\n", ":1: a command is three numbers"),
-        ("t,v,w\nx,y,z\n", ":2: t must be a number of seconds"),
+        ("t,v,w\nx,y,z\n", ":2: t must be a number"),
         ("-1,0.1,0\n", ":1: times must ascend"),
-        ("t,v,w\n", "no rows below the header"),
+        ("t,v,w\n", "no rows"),
     ],
 )
-def test_commands_that_make_no_sense_are_refused_with_their_line(tmp_path, text, what):
+def test_commands_that_make_no_sense_are_refused_with_their_line(tmp_path, text, words):
     (tmp_path / "c.csv").write_text(text)
-    with pytest.raises(InputError, match=what):
+    with pytest.raises(InputError, match=words):
         read_commands(tmp_path / "c.csv")
 
 

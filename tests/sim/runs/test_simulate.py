@@ -6,28 +6,21 @@ from pathlib import Path as FilePath
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from rooms import EARTH, SOURCES, scene_of, wavy_map
 
 from magtwin.errors import InputError
-from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import rotate, yaw_from_quat
 from magtwin.path import Path, path_named
 from magtwin.run.run import COLUMNS, Run
 from magtwin.sim.interference import ambient_gradient_nt_m
 from magtwin.sim.runs.simulate import simulate
 from magtwin.spec.drive import DriveSpec
-from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
+from magtwin.spec.magnetics import PlatformFieldSpec, SourceSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import ImuSpec, MagnetometerSpec
 
-EARTH_NT = np.array([-2_600.0, 24_000.0, -38_000.0])
-EARTH = EarthFieldSpec(
-    b_world_nt=tuple(EARTH_NT.tolist()),
-    latitude_deg=29.6,
-    longitude_deg=-82.3,
-    height_m=30.0,
-    date="2026-01-01",
-)
+EARTH_NT = np.array(EARTH.b_world_nt)
 ROBOT = RobotSpec(
     name="robot",
     asset=FilePath("robot.usda"),
@@ -35,23 +28,9 @@ ROBOT = RobotSpec(
     platform=PlatformFieldSpec(hard_iron_nt=(620.0, -430.0, 250.0), lidar_nt=(160.0, -90.0, 130.0)),
     drive=DriveSpec(localization_std_m=0.0, localization_yaw_std=0.0, localization_latency_s=0.0),
 )
-SOURCES = (
-    SourceSpec(name="chair", p_world=(0.5, 0.3, -0.5), m_world=(5.0, -3.0, 20.0)),
-    SourceSpec(name="desk", p_world=(-1.0, 0.8, -0.4), m_world=(-9.0, 4.0, -12.0)),
-)
-SURVEYED = Scene(name="surveyed", map_layer=FilePath("map.usdc"), robot=ROBOT)
-KNOWN = Scene(name="known", map_layer=FilePath("map.usdc"), robot=ROBOT, earth=EARTH, sources=SOURCES)
+SURVEYED = scene_of(ROBOT, "surveyed")
+KNOWN = scene_of(ROBOT, "known", earth=EARTH, sources=SOURCES)
 LINE = Path("line", np.array([[-0.5, 0.2], [0.5, 0.2]]))
-
-
-def wavy_map(extent_m: tuple[float, float] = (6.0, 3.5)) -> AnomalyMap:
-    values = 41_000 + 1_000 * np.random.default_rng(5).standard_normal((4, 15, 25))
-    return AnomalyMap(
-        values_nt=values,
-        origin_m=(-extent_m[0] / 2, -extent_m[1] / 2),
-        cell_m=(extent_m[0] / 24, extent_m[1] / 14),
-        headings_rad=np.arange(4) * np.pi / 2,
-    )
 
 
 MAP = wavy_map()
@@ -251,7 +230,7 @@ def test_one_seed_gives_identical_arrays_and_another_gives_others():
         ({"duration_s": -1.0}, "duration_s must be above 0 s"),
         ({"duration_s": float("inf")}, "duration_s must be above 0 s and finite, got inf"),
         ({"duration_s": 3600.0, "rate_hz": 1e4}, "more than 20,000,000; lower `rate_hz` to 5556 Hz"),
-        ({"anomaly_map": wavy_map((0.5, 3.5)), "outside": "raise"}, "off the map"),
+        ({"anomaly_map": wavy_map(extent_m=(0.5, 3.5)), "outside": "raise"}, "off the map"),
         ({"lidar": "maybe"}, 'lidar must be "schedule", "on" or "off"'),
         ({"outside": "guess"}, 'outside must be "nan", "clamp" or "raise"'),
         ({"scene": SURVEYED, "anomaly_map": FLAT}, "'surveyed' has a constant map and no Earth field"),
