@@ -62,10 +62,7 @@ def test_a_table_becomes_the_dataclass_with_nested_tables_and_paths_from_its_fol
     ("text", "message"),
     [
         ('name = "a"\nplase = [1, 2]', r"cart.toml:2: unknown key 'plase'; did you mean 'place'"),
-        (
-            'name = "a"\n[spare]\nradius = 2',
-            r"cart.toml:3: \[spare\] unknown key 'radius'; did you mean 'radius_m'",
-        ),
+        ('name = "a"\n[spare]\nradius = 2', r"cart.toml:3: \[spare\] unknown key 'radius'; .* 'radius_m'"),
         ('name = "a"\ngear = "hgh"', r"cart.toml:2: gear must be one of 'low', 'high', got 'hgh'"),
         ("laps = 2", r"cart.toml: key 'name' is missing"),
         ('name = "a"\ncargo = 3', r"cart.toml:2: cargo must be a table, got 3"),
@@ -92,18 +89,15 @@ def test_a_toml_with_a_byte_order_mark_is_read_and_its_lines_are_named(tmp_path)
     assert kind_of(file) is SCENE_TOML
 
 
-def test_a_link_to_nothing_is_called_so(tmp_path):
+def test_a_missing_file_is_refused_with_a_near_name_or_what_its_link_names(tmp_path):
     (tmp_path / "run.parquet").symlink_to("gone.parquet")
-    with pytest.raises(InputError, match=r"no such run: a link to 'gone\.parquet', which does not exist"):
-        existing(tmp_path / "run.parquet", "run")
-
-
-def test_only_a_near_name_is_suggested(tmp_path):
-    (tmp_path / "run.parquet").touch()
-    with pytest.raises(InputError, match=r"rum\.parquet: no such run; did you mean 'run\.parquet'\?"):
-        existing(tmp_path / "rum.parquet", "run")
-    with pytest.raises(InputError, match=r"no such run$"):
-        existing(tmp_path / "mine.parquet", "run")
+    for name, words in {
+        "run.parquet": r"a link to 'gone\.parquet', which does not exist",
+        "rum.parquet": r"no such run; did you mean 'run\.parquet'\?",
+        "mine.parquet": "no such run$",
+    }.items():
+        with pytest.raises(InputError, match=words):
+            existing(tmp_path / name, "run")
 
 
 def test_an_output_below_a_file_is_refused(tmp_path):

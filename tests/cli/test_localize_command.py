@@ -68,12 +68,8 @@ def test_without_a_true_pose_it_estimates_and_gives_no_verdict(here: Path) -> No
     run.save("bare.parquet", force=True)
     with pytest.raises(InputError, match="no true pose to start from; give a `prior`"):
         localization("bare.parquet", "lab", method="odometry")
-    main(
-        [
-            *("localize", "bare.parquet", "--map", "lab", "--method", "odometry"),
-            *("--prior=0,0,0.8", "--out", "bare", "--quiet"),
-        ]
-    )
+    words = ["localize", "bare.parquet", "--map", "lab", "--method", "odometry", "--prior=0,0,0.8"]
+    main([*words, "--out", "bare", "--quiet"])
     assert not (here / "bare" / "truth.tum").exists()
     result = localization("bare.parquet", "lab", method="odometry", prior="0,0,0.8")
     assert result.report().verdict == "No verdict: the run has no true pose to compare with."
@@ -148,14 +144,8 @@ def test_a_network_predicts_the_own_field_at_the_poses_of_a_first_pass(here: Pat
         (["--rate-hz", "0"], "--rate-hz must be above 0 Hz, got 0.0"),
         (["--sensor", "whit_nt=3"], "--sensor has no 'whit_nt'; did you mean 'white_nt'?"),
         (["--sensor", "white_nt=much"], "--sensor white_nt is a number, got 'much'"),
-        (
-            ["--sensor", "lever_arm_m=0.1"],
-            "--sensor lever_arm_m is two numbers [m], such as [0.1,0], got 0.1",
-        ),
-        (
-            ["--sensor", "white_nt=1e300"],
-            "white_nt of SensorModel must be finite and not negative, at most 1e",
-        ),
+        (["--sensor", "lever_arm_m=0.1"], "lever_arm_m is two numbers [m]"),
+        (["--sensor", "white_nt=1e300"], "white_nt of SensorModel must be finite"),
         (["--seed", "-1"], "--seed must be a whole number from 0 up, got -1"),
         (["--odometry", "yaw_std=-1"], "--odometry yaw_std of OdometryModel must be finite and not negative"),
         (["--out", "run.parquet"], "run.parquet: exists already; give --force"),

@@ -176,12 +176,7 @@ def test_convert_takes_frames_a_second_units_and_the_scene(run, written, lab_sce
         ("run.parquet", "new.csv", ["--scene", "x.usda"], "a table shows no scene; drop --scene"),
         ("run.parquet", "new.rrd", ["--scene", "x.usda"], "x.usda: no such scene"),
         ("run.parquet", "new.mcap", ["--usd-fps", "5"], "rosbag2 has no option 'fps'"),
-        (
-            "run.parquet",
-            "new.db3",
-            [],
-            "rosbag2 in SQLite is read, not written; give .mcap, the default of ROS 2;",
-        ),
+        ("run.parquet", "new.db3", [], "rosbag2 in SQLite is read, not written; give .mcap"),
         ("run.parquet", "new.usd", ["--usd-fps", "-5"], "fps must be above 0"),
         ("run.parquet", "run.parquet", ["--force"], "is the run itself"),
         ("runn.csv", "new.parquet", [], "runn.csv: no such run; did you mean 'run.csv'?"),
