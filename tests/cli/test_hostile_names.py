@@ -79,11 +79,3 @@ def test_a_name_is_still_recognised_and_json_gives_it_back(files, capsys):
     assert (
         EVIL in str(said) or EVIL in json.dumps(said, ensure_ascii=False) or EVIL in said["metadata"]["scene"]
     )
-
-
-def test_pages_hold_no_markup_of_a_file(files, tmp_path, capsys):
-    page = tmp_path / "page.html"
-    printed(capsys, "report", files / "run.npz", "--out", page)
-    text = page.read_text(encoding="utf-8")
-    assert "<script>alert" not in text
-    assert not set(text) & set(HARMFUL)

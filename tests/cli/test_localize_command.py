@@ -174,19 +174,6 @@ def test_a_run_off_the_map_or_without_odometry_is_refused(here: Path) -> None:
         localization(without, field, method="odometry")
 
 
-def test_a_compensator_predicts_the_robots_own_field_from_a_drive_of_the_session(here: Path) -> None:
-    twin = mt.in_session(mt.open_twin("lab"), 4)
-    drive, run = (mt.simulate(twin, path, seed=4, duration_s=30) for path in ("figure8", "loops"))
-    told: dict[str, object] = {"method": "odometry", "compensator": "iron", "calibration": drive}
-    result = localization(run, twin.field, **told)
-    own = result.run["b_measured_nt"] - result.run["b_map_nt"]
-    left = own - result.run["disturbance_nt"]
-    assert np.std(left) < 0.8 * np.std(own)
-    assert result.problem.calibration is not None
-    with pytest.raises(InputError, match="needs a map and a `calibration` drive"):
-        localization(run, twin.field, method="odometry", compensator="iron")
-
-
 def test_a_map_of_another_checksum_is_told_of(here: Path) -> None:
     field = mt.open_twin("lab").field
     other = dataclasses.replace(field, values_nt=field.values_nt + 5, harmonic=None, name="other")

@@ -3,23 +3,18 @@
 import io
 import json
 import os
-import pty
 import re
 import subprocess
 import sys
 import threading
 import time
 from contextlib import suppress
-from pathlib import Path
 
 import pytest
 from waiting import wait_until
 
-import magtwin
 from magtwin.cli import main
 from magtwin.cli.progress import EVERY_S, FIRST_S, Step, Watch, step, watched
-
-ROOT = Path(magtwin.__file__).parents[1]
 
 
 class Clock:
@@ -166,34 +161,3 @@ def test_json_stays_json_while_progress_goes_to_stderr(long_run, monkeypatch, ca
     assert re.match(r"  Reading a-long.*( \.\.\.|: [1-9] s so far)\n", error)
     main(["info", str(long_run), "--quiet"])
     assert capsys.readouterr() == ("", "")
-
-
-def test_on_a_terminal_there_is_a_bar_with_rate_and_time_left(tmp_path):
-    code = """
-import time
-from magtwin.cli.progress import watched, progress
-with watched():
-    with progress("Driving", "runs") as advance:
-        for k in range(41):
-            advance(k, 40, "lap")
-            time.sleep(0.02)
-print("the end")
-"""
-    parent, child = pty.openpty()
-    env = os.environ | {"PYTHONPATH": str(ROOT), "TERM": "xterm", "COLUMNS": "100"}
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=child, env=env)
-    os.close(child)
-    shown = b""
-    while True:
-        try:
-            block = os.read(parent, 4096)
-        except OSError:
-            break
-        if not block:
-            break
-        shown += block
-    assert process.communicate()[0] == b"the end\n"
-    os.close(parent)
-    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.decode())
-    assert re.search(r"  Driving ━.* 40/40 .*runs/s 0:00:00 lap", text)
-    assert "so far" not in text

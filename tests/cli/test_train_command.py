@@ -209,29 +209,6 @@ def test_the_configuration_of_any_kind_repeats_its_weights_to_the_byte(data, kin
     assert again.read_bytes() == kinds[kind][0].read_bytes()
 
 
-@pytest.mark.parametrize("bent", [True, False])
-def test_a_hybrid_keeps_its_network_only_where_the_base_leaves_something(tmp_path, bent):
-    runs = {name: a_run(i, "eight") for i, name in enumerate("abcdefg")}
-    for name, run in runs.items():
-        speed = run["odom_v"][:, 0]
-        field = run["b_measured_nt"] + (300 * np.abs(speed) if bent else 0)
-        runs[name] = run.with_columns(b_measured_nt=field)
-    build_dataset(runs, HILLS, tmp_path / "set")
-    options = {
-        "features": "odom_v_x,imu_w_z",
-        "layers": (16,),
-        "epochs": 8,
-        "batch": 32,
-        "lr": 0.02,
-        "seed": 3,
-    }
-    mt.train(tmp_path / "set", out=tmp_path / "h.safetensors", model="hybrid", **options)
-    metadata = load_predictor(tmp_path / "h.safetensors").metadata
-    assert metadata["network"] == ("kept" if bent else "left out")
-    if bent:
-        assert metadata["test_mae_nt"] < 0.5 * metadata["test_ridge_mae_nt"]
-
-
 def test_a_linear_model_goes_on_from_another(data, kinds):
     result = mt.train(data, model="linear", init=kinds["linear"][0], penalty=1e9)
     before = load_predictor(kinds["linear"][0])

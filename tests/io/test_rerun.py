@@ -133,21 +133,6 @@ def test_the_floor_is_viridis_of_the_map_and_see_through_where_it_is_unknown(par
     assert Scale.over(field, np.empty(0)).colours(np.array([np.nan]))[0, 3] == 0
 
 
-def test_the_field_arrow_goes_through_the_sensor_and_is_there_only_where_the_vector_is_known(
-    parts, written, tmp_path
-):
-    run, rest = parts
-    times, values = columns_of(written, "world/robot/magnetometer/field")
-    arrow, tail = (np.array(values[f"Arrows3D:{key}"][-1][0]) for key in ("vectors", "origins"))
-    b = run["b_vector_nt"][np.searchsorted(run["t"], times[-1] / 1e9 - 1e-6)]
-    np.testing.assert_allclose(arrow / np.linalg.norm(arrow), b / np.linalg.norm(b), atol=1e-6)
-    np.testing.assert_allclose(tail, -arrow / 2, atol=1e-6)
-    without = run.take(slice(50))
-    without = without.with_columns(b_vector_nt=np.full((50, 3), np.nan))
-    write_rrd(without, tmp_path / "run.rrd", **rest)
-    assert not columns_of(tmp_path / "run.rrd", "world/robot/magnetometer/field")[1]
-
-
 def rerun(*arguments):
     """Rerun's own command line."""
     program = FilePath(rerun_cli.__file__).with_name("rerun")
