@@ -137,7 +137,7 @@ def test_a_budget_is_made_where_the_scene_is_at_hand(room, lab_scene, tmp_path, 
     main(["evaluate", net, "--runs", drives[2], *words, "--out", str(out)])
     told = json.loads(capsys.readouterr().out)["budget"]["models"]
     assert [one["model"] for one in told] == ["naive", "net", "Tolles-Lawson, lab"]
-    page = (out / "evaluation.md").read_text()
+    page = (out / "evaluation.html").read_text()
     for one in told:
         left = [term["mae_closed_in_turn_nt"] for term in one["terms"]]
         assert left[-1] == pytest.approx(0, abs=1e-6)
