@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from magtwin import compiled
 from magtwin.compiled import Loops, in_threads
 
 
@@ -20,23 +19,6 @@ def test_loops_open_after_as_much_work_as_opening_costs(monkeypatch):
     assert loops.after(500) is None
     assert loops.after(100) is sys.modules["json"]
     assert loops.after(0) is loops.open() is loops.code
-
-
-def test_a_steady_process_opens_loops_only_when_told_to(monkeypatch):
-    monkeypatch.delitem(sys.modules, "numba", raising=False)
-    loops = Loops("json", pays=1_000)
-    with compiled.steady():
-        assert loops.after(1e9) is None
-        assert loops.open() is loops.after(0) is sys.modules["json"]
-    loops = Loops("json", pays=1_000)
-    assert loops.after(1e9) is not None
-
-
-def test_loops_open_earlier_if_numba_is_loaded_already(monkeypatch):
-    monkeypatch.setitem(sys.modules, "numba", sys)
-    loops = Loops("json", pays=1_000)
-    assert loops.after(1_000 / compiled.NUMBA_SHARE - 1) is None
-    assert loops.after(1) is not None
 
 
 def test_without_numba_the_plain_code_goes_on_and_opening_raises_import_error(monkeypatch):

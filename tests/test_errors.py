@@ -1,7 +1,5 @@
 """Refusals: the text names a parameter as in Python, the command line as a flag."""
 
-import pickle
-
 import pytest
 
 from magtwin.errors import InputError, UnknownNameError, find, hint, near
@@ -36,17 +34,6 @@ def test_a_parameter_that_begins_a_text_or_that_an_error_is_about_becomes_its_fl
 def test_a_text_of_a_file_that_looks_like_a_call_stays():
     for text in ("name `force(__import__)` is unknown", "name `force(1 +)`", "name `force((((`"):
         assert InputError(text).in_flags(FLAGS) == text
-
-
-def test_a_value_of_several_lines_is_quoted_in_one():
-    assert (
-        str(InputError("got Matrix(1, 2,\n       3, 4); correct it")) == "got Matrix(1, 2, 3, 4); correct it"
-    )
-
-
-def test_a_parameter_survives_pickling_and_is_none_by_default():
-    assert pickle.loads(pickle.dumps(InputError("give `force=True`", parameter="force"))).parameter == "force"
-    assert UnknownNameError("no path").parameter is None
 
 
 def test_a_name_of_a_file_that_is_no_text_is_unknown():

@@ -8,7 +8,7 @@ from typing import Literal
 import pytest
 
 from magtwin.errors import InputError
-from magtwin.files.file import existing, sha256, shipped
+from magtwin.files.file import existing
 from magtwin.files.kinds import SCENE_TOML, kind_of
 from magtwin.files.outputs import check_free, output
 from magtwin.files.settings import from_table, read_toml
@@ -62,10 +62,7 @@ def test_a_table_becomes_the_dataclass_with_nested_tables_and_paths_from_its_fol
     ("text", "message"),
     [
         ('name = "a"\nplase = [1, 2]', r"cart.toml:2: unknown key 'plase'; did you mean 'place'"),
-        (
-            'name = "a"\n[spare]\nradius = 2',
-            r"cart.toml:3: \[spare\] unknown key 'radius'; did you mean 'radius_m'",
-        ),
+        ('name = "a"\n[spare]\nradius = 2', r"cart.toml:3: \[spare\] unknown key 'radius'; .* 'radius_m'"),
         ('name = "a"\ngear = "hgh"', r"cart.toml:2: gear must be one of 'low', 'high', got 'hgh'"),
         ("laps = 2", r"cart.toml: key 'name' is missing"),
         ('name = "a"\ncargo = 3', r"cart.toml:2: cargo must be a table, got 3"),
@@ -92,24 +89,15 @@ def test_a_toml_with_a_byte_order_mark_is_read_and_its_lines_are_named(tmp_path)
     assert kind_of(file) is SCENE_TOML
 
 
-def test_a_missing_file_is_refused_by_the_near_name(tmp_path):
-    (tmp_path / "lab.toml").touch()
-    with pytest.raises(InputError, match=r"lav.toml: no such TOML file; did you mean 'lab.toml'"):
-        read_toml(tmp_path / "lav.toml")
-
-
-def test_a_link_to_nothing_is_called_so(tmp_path):
+def test_a_missing_file_is_refused_with_a_near_name_or_what_its_link_names(tmp_path):
     (tmp_path / "run.parquet").symlink_to("gone.parquet")
-    with pytest.raises(InputError, match=r"no such run: a link to 'gone\.parquet', which does not exist"):
-        existing(tmp_path / "run.parquet", "run")
-
-
-def test_only_a_near_name_is_suggested(tmp_path):
-    (tmp_path / "run.parquet").touch()
-    with pytest.raises(InputError, match=r"rum\.parquet: no such run; did you mean 'run\.parquet'\?"):
-        existing(tmp_path / "rum.parquet", "run")
-    with pytest.raises(InputError, match=r"no such run$"):
-        existing(tmp_path / "mine.parquet", "run")
+    for name, words in {
+        "run.parquet": r"a link to 'gone\.parquet', which does not exist",
+        "rum.parquet": r"no such run; did you mean 'run\.parquet'\?",
+        "mine.parquet": "no such run$",
+    }.items():
+        with pytest.raises(InputError, match=words):
+            existing(tmp_path / name, "run")
 
 
 def test_an_output_below_a_file_is_refused(tmp_path):
@@ -150,21 +138,6 @@ def test_a_folder_with_files_of_the_user_is_not_replaced(tmp_path):
     assert (tmp_path / "run" / "notes.txt").exists()
 
 
-def test_sha256_is_that_of_fips_180_abc(tmp_path):
-    (tmp_path / "abc").write_bytes(b"abc")
-    assert sha256(tmp_path / "abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
-
-
-def test_shipped_files_are_found_and_missing_ones_refused():
-    assert shipped("robots", "turtlebot4", "robot.toml").is_file()
-    with pytest.raises(InputError, match="reinstall magtwin"):
-        shipped("robots", "nobody")
-
-
-def test_existing_gives_the_path_back(tmp_path):
-    assert existing(tmp_path, "folder") == tmp_path
-
-
 @pytest.mark.parametrize(
     "text", ['"""' * 30_001, "x = '''a" + "\\n''''" * 30_000, 'x = "' + '\\\\"' * 60_000]
 )
@@ -178,9 +151,3 @@ def test_levels_after_a_text_that_ends_in_a_quote_are_counted(quote, tmp_path):
     text = f"x = [{3 * quote}a{4 * quote}, {'[' * 40}{']' * 40}, {2 * quote}]"
     with pytest.raises(InputError, match="nests deeper than 16 levels"):
         read_cart(tmp_path, text)
-
-
-def test_a_table_that_is_right_makes_no_refusals(tmp_path, monkeypatch):
-    monkeypatch.delattr("magtwin.files.settings._Where.refused")
-    cart = read_cart(tmp_path, 'name = "a"\nlaps = 2\n' + "[[wheels]]\nradius_m = 0.1\n" * 50)
-    assert len(cart.wheels) == 50

@@ -47,9 +47,3 @@ def test_wrapping_changes_an_angle_by_whole_turns_into_minus_pi_to_pi(angle):
     assert -np.pi <= wrapped < np.pi
     turns = (angle - wrapped) / (2 * np.pi)
     assert_allclose(turns, np.round(turns), atol=1e-9)
-
-
-def test_real_first_and_real_last_are_inverse():
-    q = A.as_quat()
-    assert_allclose(frames.wxyz_from_xyzw(q)[:, 0], q[:, 3])
-    assert_allclose(frames.xyzw_from_wxyz(frames.wxyz_from_xyzw(q)), q)

@@ -91,11 +91,6 @@ def test_a_twin_reads_the_map_that_is_named_or_else_that_of_the_stage(building, 
         assert_array_equal(map_of(run).values_nt, field.values_nt)
 
 
-def test_a_scene_in_memory_takes_another_map_too(building, late, maps):
-    twin = magtwin.open_twin(magtwin.open_twin(building, lab=LAB).scene, map_layer=late)
-    assert_array_equal(twin.field.values_nt, maps[1].values_nt)
-
-
 def test_what_is_no_map_layer_is_refused_with_the_option(building, tmp_path, capsys):
     with pytest.raises(InputError, match=r"building\.usda: is no map layer; give the layer of a map"):
         magtwin.open_twin(building, lab=LAB, map_layer=building)

@@ -9,7 +9,6 @@ from pathlib import Path as FilePath
 import numpy as np
 import pytest
 
-from magtwin.errors import InputError
 from magtwin.field.fit.fit import fit
 from magtwin.field.maps.difference import difference
 from magtwin.field.survey.readings import Readings
@@ -150,18 +149,6 @@ def test_every_noun_shows_itself_in_five_lines_and_in_html(twin, run, learnt):
         assert Tags(noun._repr_html_()).tags <= allowed, name
 
 
-def test_a_map_tells_extent_spacing_headings_method_height_day_and_range(twin):
-    text = repr(twin.field)
-    for words in (
-        "121 x 71, 0.05 x 0.05 m apart, x -3.00 to 3.00 m, y -1.75 to 1.75 m",
-        "headings  24: 0, 15, 30, 45, ",
-        f"{twin.field.created}, sensor at 0.405 m",
-        "method    harmonic",
-        f"{twin.field.values_nt.min():,.0f} to {twin.field.values_nt.max():,.0f} nT",
-    ):
-        assert words in text
-
-
 def test_hostile_names_stay_in_their_line_and_are_escaped_in_html(twin, run):
     field = dataclasses.replace(twin.field, name=HOSTILE, method=HOSTILE, source=HOSTILE)
     named = {
@@ -199,18 +186,6 @@ def test_a_run_is_drawn_with_units_on_every_axis(run, twin):
     assert "time [s]; shaded while the LiDAR is on" in words
     assert figure._repr_png_().startswith(b"\x89PNG")
     pickle.dumps(figure)
-
-
-def test_a_run_is_drawn_by_the_columns_that_it_has(run):
-    few = run.select("mocap_p", "b_measured_nt").plot()
-    x, y = labels_of(few)
-    assert ("x [m]" in x, "measured field\n[µT]" in y, len(y)) == (True, True, 3)
-    own = Run({"t": np.arange(9.0), "mine": np.arange(9)}, {}, {"mine": Column("K", "", "warmth")}).plot()
-    assert labels_of(own) == (["time [s]"], ["mine\n[K]"])
-    with pytest.raises(InputError, match="the run has no rows"):
-        run.take(slice(0)).plot()
-    with pytest.raises(InputError, match="neither positions nor columns of numbers"):
-        Run({"t": np.arange(3.0)}).plot()
 
 
 CAME_LATER = {

@@ -7,7 +7,7 @@ import pytest
 
 import magtwin
 from magtwin.errors import InputError
-from magtwin.twin import in_session, in_session_of, open_twin, simulate, sweep
+from magtwin.twin import in_session, in_session_of, open_twin, simulate
 from magtwin.twin.opening import geometry
 
 
@@ -25,32 +25,6 @@ def test_a_run_is_in_a_session_of_its_seed_unless_another_is_chosen(lab_scene):
     offsets = [float(np.mean(run["b_total_nt"] - run["b_map_nt"])) for run in (first, other, surveyed)]
     assert min(offsets[0], offsets[1]) - offsets[2] > 200  # hard_iron_drift_nt since the survey
     assert offsets[0] != offsets[1]
-
-
-def test_a_sweep_takes_paths_in_turn_and_deals_sessions_in_blocks(lab_scene):
-    twin = open_twin(lab_scene, magnetometer="physical")
-    runs = list(sweep(twin, ["sine", "figure8"], 4, seed=7, sessions=2, duration_s=1.0, rate_hz=5.0))
-    assert [run.metadata["path"] for run in runs] == ["sine", "figure8"] * 2
-    assert [run.metadata["seed"] for run in runs] == [7, 8, 9, 10]
-    sessions = [(run.metadata["session"], run.metadata["session_seed"]) for run in runs]
-    assert sessions == [(0, 7), (0, 7), (1, 7), (1, 7)]
-    again = simulate(in_session(twin, 1, seed=7), "figure8", seed=10, duration_s=1.0, rate_hz=5.0)
-    assert all(np.array_equal(runs[3][name], again[name], equal_nan=True) for name in ("t", "b_measured_nt"))
-
-
-def test_speeds_of_a_sweep_are_drawn_when_asked_for(lab_scene):
-    twin = open_twin(lab_scene, magnetometer="physical")
-    options = {"duration_s": 1.0, "rate_hz": 5.0, "sessions": "survey"}
-    drawn = [run.metadata["speed_m_s"] for run in sweep(twin, "sine", 3, speeds="drawn", **options)]
-    assert len(set(drawn)) == 3
-    assert all(0.2 <= speed <= 0.3 for speed in drawn)
-    assert drawn == [run.metadata["speed_m_s"] for run in sweep(twin, "sine", 3, speeds="drawn", **options)]
-    for wrong, text in (("fast", '"drawn"'), (0, None)):
-        with pytest.raises(InputError, match=text):
-            sweep(twin, "sine", 2, speeds=wrong, **options)
-    for wrong in (0, True, -1):
-        with pytest.raises(InputError):
-            sweep(twin, "sine", wrong)
 
 
 def test_a_shipped_scene_is_opened_by_its_name(tmp_path, monkeypatch):

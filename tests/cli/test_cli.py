@@ -1,7 +1,6 @@
 """The command line: what it writes, and how it refuses."""
 
 import json
-import math
 import os
 import signal
 import subprocess
@@ -13,68 +12,18 @@ import pytest
 from waiting import PATIENCE_S, wait_until
 
 from magtwin.cli import main
-from magtwin.cli.maps.map import headings_rad
-from magtwin.errors import InputError, RepairWarning
+from magtwin.errors import InputError
 from magtwin.parallel import check_room, machine
 
-HEAVY = ("torch", "pxr", "rerun", "scipy", "numba", "pyarrow", "pyvista", "matplotlib")
 
-
-def heavy_modules_after(code: str) -> set[str]:
-    """Which heavy libraries a fresh Python has loaded after `code`."""
-    script = f"import sys\n{code}\nprint(*[m for m in {HEAVY} if m in sys.modules], file=sys.stderr)"
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    return set(result.stderr.split())
-
-
-def test_importing_magtwin_loads_nothing_heavy():
-    assert heavy_modules_after("import magtwin, magtwin.spec.scene, magtwin.run.run, magtwin.path") == set()
-
-
-def survey(folder, *, headings=(0, 90, 180, 270), field=41_000.0, edit=lambda heading, lines: lines):
+def survey(folder):
     """A small survey, 3 x 2 nodes a heading, in the form of the released one."""
     folder.mkdir()
-    for heading in headings:
-        lines = ["# x,y,theta,scalar_mag "]
-        for y in (0.0, 0.25):
-            lines += [f"{x},{y},{np.radians(heading)},{field + 100 * x + y}" for x in (0.0, 0.25, 0.5)]
-        (folder / f"{heading}_map.csv").write_text("\n".join(edit(heading, lines)) + "\n")
+    nodes = [(x, y) for y in (0, 0.25) for x in (0, 0.25, 0.5)]
+    for heading in (0, 90, 180, 270):
+        rows = [f"{x},{y},{np.radians(heading)},{41_000 + 100 * x + y}" for x, y in nodes]
+        (folder / f"{heading}_map.csv").write_text("\n".join(["# x,y,theta,scalar_mag ", *rows]) + "\n")
     return folder
-
-
-def replace_line(at, text):
-    """An edit of heading 90 that puts `text` in place of line `at`, counted from 1, or drops it for None."""
-
-    def edit(heading, lines):
-        if heading != 90:
-            return lines
-        return [*lines[: at - 1], *([] if text is None else [text]), *lines[at:]]
-
-    return edit
-
-
-@pytest.mark.parametrize(
-    ("options", "where", "what"),
-    [
-        ({"headings": (0, 90, 180)}, "survey", "270"),
-        ({"edit": replace_line(3, "0.25,0.0,1.57")}, "90_map.csv:3", "4"),
-        ({"edit": replace_line(3, "0.25,zero,1.57,41000")}, "90_map.csv:3", "zero"),
-        ({"edit": replace_line(3, "0.25,0.0,1.57,nan")}, "90_map.csv:3", "nan"),
-        ({"edit": replace_line(3, None)}, "90_map.csv", "0.25"),
-        ({"edit": replace_line(3, "0.0,0.0,1.57,41001")}, "90_map.csv:3", "has a value already, on line 2"),
-        ({"field": 41.0}, "survey", "uT"),
-        ({"edit": lambda heading, lines: []}, "0_map.csv", "empty"),
-    ],
-    ids=["heading missing", "ragged", "not a number", "nan", "hole", "two values", "wrong unit", "empty"],
-)
-def test_a_broken_survey_is_refused_in_one_line_and_nothing_is_written(
-    tmp_path, refusal, options, where, what
-):
-    folder = survey(tmp_path / "survey", **options)
-    line = refusal("map", "import", folder, "--out", tmp_path / "map.usdc")
-    assert where in line
-    assert what in line
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["survey"]
 
 
 def test_a_survey_becomes_a_map_that_info_and_plot_show(tmp_path, capsys, refusal):
@@ -88,13 +37,6 @@ def test_a_survey_becomes_a_map_that_info_and_plot_show(tmp_path, capsys, refusa
     assert "CC0-1.0" in capsys.readouterr().out
     assert "exists already; give --force" in refusal("map", "import", folder, "--out", layer)
     main(["map", "import", str(folder), "--out", str(layer), "--force"])
-
-
-def test_a_shipped_scene_is_found_beside_a_folder_of_its_name(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "lab").mkdir()
-    main(["scene", "lab", "--out", "out", "--json"])
-    assert (tmp_path / "out" / "lab.usda").is_file()
 
 
 def test_a_scene_whose_map_was_changed_is_refused(tmp_path, refusal, lab_scene):
@@ -146,17 +88,6 @@ main(["info", "run.parquet"])
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"magtwin: {tmp_path}: no room for temporary files (")
     assert [file.name for file in tmp_path.iterdir()] == ["run.parquet"]
-
-
-def test_run_takes_the_kind_of_magnetometer(lab_scene, tmp_path):
-    from magtwin.io.tables import read_parquet
-
-    for options, kind in ((["--magnetometer", "map-only"], "map-only"), (["--network", "none"], "physical")):
-        out = tmp_path / f"{kind}.parquet"
-        main(["run", str(lab_scene), "--duration-s", "1", "--out", str(out), "--json", *options])
-        run = read_parquet(out)
-        assert run.metadata["magnetometer"] == kind
-        assert (run["b_disturbance_nt"] == 0).all() == (kind == "map-only")
 
 
 def test_options_come_from_the_environment_and_from_magtwin_toml(tmp_path, monkeypatch, capsys, lab_scene):
@@ -216,20 +147,6 @@ def test_a_variable_that_names_no_option_is_reported(tmp_path, monkeypatch, caps
     assert "MAGTWIN" not in capsys.readouterr().err
 
 
-def test_headings_that_are_given_twice_are_reported():
-    with pytest.warns(RepairWarning, match="--headings-deg 0,360,90: 2 headings, as some are equal"):
-        assert headings_rad("0,360,90") == pytest.approx([0, math.pi / 2])
-
-
-def test_info_tells_of_stages_and_runs(lab_scene, tmp_path, capsys):
-    main(["run", str(lab_scene), "--duration-s", "2", "--out", str(tmp_path / "a.parquet")])
-    capsys.readouterr()
-    main(["info", str(lab_scene)])
-    assert "MagtwinMagnetometerAPI" in capsys.readouterr().out
-    main(["info", str(tmp_path / "a.parquet"), "--json"])
-    assert json.loads(capsys.readouterr().out)["figures"]["duration"]["unit"] == "s"
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has /dev/full")
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_a_stdout_that_is_full_is_named(unbuffered):
@@ -268,32 +185,3 @@ def test_what_needs_more_memory_than_is_free_is_refused_before_it_is_asked_for(m
     check_room(10**9, "it", "take less", "size")
     with pytest.raises(InputError, match="it needs about 3 GB of memory, and 2 GB are free; take less"):
         check_room(3e9, "it", "take less", "size")
-
-
-def test_a_limit_of_addresses_counts_as_memory(monkeypatch):
-    import resource
-
-    limits = {"soft": resource.RLIM_INFINITY}
-    monkeypatch.setattr(resource, "getrlimit", lambda kind: (limits["soft"], resource.RLIM_INFINITY))
-    monkeypatch.setattr(machine, "free_memory", lambda: 10**15)
-    assert machine.room() == 10**15
-    limits["soft"] = 10**12
-    assert 0 < machine.room() < 10**12
-    limits["soft"] = 1
-    assert machine.room() == 0
-
-
-@pytest.mark.parametrize("error", [MemoryError("Unable to allocate 336. MiB for an array with shape (3,)")])
-def test_too_little_memory_is_told_in_one_line(error, monkeypatch, tmp_path, capsys):
-    import magtwin.twin
-
-    def fail(*args, **options):
-        raise error
-
-    monkeypatch.setattr(magtwin.twin, "scene_from_toml", fail)
-    with pytest.raises(SystemExit) as stop:
-        main(["scene", "lab", "--out", str(tmp_path / "x"), "--quiet"])
-    assert stop.value.code == 1
-    assert capsys.readouterr().err == (
-        "magtwin: not enough memory (Unable to allocate 336. MiB); give less data or smaller options\n"
-    )

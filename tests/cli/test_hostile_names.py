@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from magtwin.cli import main
-from magtwin.report.summary import in_markdown, printable_lines
 from magtwin.run.run import Column, Run
 
 EVIL = "a\x1b]0;owned\x07\x1b[31mb\u202ec\x9b2Jd\x7f<script>alert(1)</script>"
@@ -80,16 +79,3 @@ def test_a_name_is_still_recognised_and_json_gives_it_back(files, capsys):
     assert (
         EVIL in str(said) or EVIL in json.dumps(said, ensure_ascii=False) or EVIL in said["metadata"]["scene"]
     )
-
-
-def test_pages_hold_no_markup_of_a_file(files, tmp_path, capsys):
-    page = tmp_path / "page.html"
-    printed(capsys, "report", files / "run.npz", "--out", page)
-    text = page.read_text(encoding="utf-8")
-    assert "<script>alert" not in text
-    assert not set(text) & set(HARMFUL)
-
-
-def test_markdown_and_lines_keep_plain_text():
-    assert printable_lines("plain text, x_y\n\tmore: µT") == "plain text, x_y\n\tmore: µT"
-    assert in_markdown("a|b <i> [x](y) `c`") == r"a\|b \<i\> \[x\](y) \`c\`"

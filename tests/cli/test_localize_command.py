@@ -15,7 +15,6 @@ from magtwin.files.file import shipped
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.localization.readings import onboard
-from magtwin.localization.scores import Scores, verdict_of
 from magtwin.tasks.localizing import localization, prior_of, thinned
 
 
@@ -69,12 +68,8 @@ def test_without_a_true_pose_it_estimates_and_gives_no_verdict(here: Path) -> No
     run.save("bare.parquet", force=True)
     with pytest.raises(InputError, match="no true pose to start from; give a `prior`"):
         localization("bare.parquet", "lab", method="odometry")
-    main(
-        [
-            *("localize", "bare.parquet", "--map", "lab", "--method", "odometry"),
-            *("--prior=0,0,0.8", "--out", "bare", "--quiet"),
-        ]
-    )
+    words = ["localize", "bare.parquet", "--map", "lab", "--method", "odometry", "--prior=0,0,0.8"]
+    main([*words, "--out", "bare", "--quiet"])
     assert not (here / "bare" / "truth.tum").exists()
     result = localization("bare.parquet", "lab", method="odometry", prior="0,0,0.8")
     assert result.report().verdict == "No verdict: the run has no true pose to compare with."
@@ -149,14 +144,8 @@ def test_a_network_predicts_the_own_field_at_the_poses_of_a_first_pass(here: Pat
         (["--rate-hz", "0"], "--rate-hz must be above 0 Hz, got 0.0"),
         (["--sensor", "whit_nt=3"], "--sensor has no 'whit_nt'; did you mean 'white_nt'?"),
         (["--sensor", "white_nt=much"], "--sensor white_nt is a number, got 'much'"),
-        (
-            ["--sensor", "lever_arm_m=0.1"],
-            "--sensor lever_arm_m is two numbers [m], such as [0.1,0], got 0.1",
-        ),
-        (
-            ["--sensor", "white_nt=1e300"],
-            "white_nt of SensorModel must be finite and not negative, at most 1e",
-        ),
+        (["--sensor", "lever_arm_m=0.1"], "lever_arm_m is two numbers [m]"),
+        (["--sensor", "white_nt=1e300"], "white_nt of SensorModel must be finite"),
         (["--seed", "-1"], "--seed must be a whole number from 0 up, got -1"),
         (["--odometry", "yaw_std=-1"], "--odometry yaw_std of OdometryModel must be finite and not negative"),
         (["--out", "run.parquet"], "run.parquet: exists already; give --force"),
@@ -185,19 +174,6 @@ def test_a_run_off_the_map_or_without_odometry_is_refused(here: Path) -> None:
         localization(without, field, method="odometry")
 
 
-def test_a_compensator_predicts_the_robots_own_field_from_a_drive_of_the_session(here: Path) -> None:
-    twin = mt.in_session(mt.open_twin("lab"), 4)
-    drive, run = (mt.simulate(twin, path, seed=4, duration_s=30) for path in ("figure8", "loops"))
-    told: dict[str, object] = {"method": "odometry", "compensator": "iron", "calibration": drive}
-    result = localization(run, twin.field, **told)
-    own = result.run["b_measured_nt"] - result.run["b_map_nt"]
-    left = own - result.run["disturbance_nt"]
-    assert np.std(left) < 0.8 * np.std(own)
-    assert result.problem.calibration is not None
-    with pytest.raises(InputError, match="needs a map and a `calibration` drive"):
-        localization(run, twin.field, method="odometry", compensator="iron")
-
-
 def test_a_map_of_another_checksum_is_told_of(here: Path) -> None:
     field = mt.open_twin("lab").field
     other = dataclasses.replace(field, values_nt=field.values_nt + 5, harmonic=None, name="other")
@@ -220,36 +196,3 @@ def test_a_prior_is_drawn_about_the_truth_with_the_spread_that_it_states(here: P
     assert all(prior.is_global for prior in headings)
     assert prior_of(run, "global").sd == (np.inf,) * 3
     assert prior_of(run, "1,-2,0.5").mean == (1.0, -2.0, 0.5)
-
-
-@pytest.mark.parametrize(
-    ("scores", "said"),
-    [
-        (
-            Scores(rmse_m=0.05, anees=1.1, anees_low=0.8, anees_high=1.3, converged_s=0.0, lost_share=0.0),
-            "Better than dead reckoning: 5.0 cm RMSE against 20.0 cm, 75% less. Consistent: ANEES 1.10 per "
-            "state. Not lost.",
-        ),
-        (
-            Scores(
-                rmse_m=0.8, anees=2.0, anees_low=0.8, anees_high=1.3, diverged=True, diverged_unflagged=True
-            ),
-            "WORSE than dead reckoning: 80.0 cm RMSE against 20.0 cm. TOO CONFIDENT: ANEES 2.00 per state, "
-            "at most 1.30 expected. LOST: its error stayed above 0.5 m for more than 5 s.",
-        ),
-        (
-            Scores(rmse_m=0.2, anees=0.2, anees_low=0.8, anees_high=1.3, converged_s=3.0, lost_share=0.1),
-            "No better than dead reckoning: 20.0 cm RMSE against 20.0 cm. Too cautious: ANEES 0.20 per "
-            "state, at least 0.80 expected. Not lost, but flagged so in 10% of the readings.",
-        ),
-    ],
-)
-def test_a_verdict_says_whether_it_is_better_consistent_and_lost(scores: Scores, said: str) -> None:
-    assert verdict_of(scores, 0.2) == said
-
-
-@pytest.mark.parametrize("name", ["random.py", "my-filter.py", "class.py"])
-def test_a_localizer_has_the_name_of_a_module(tmp_path: Path, name: str) -> None:
-    with pytest.raises(SystemExit):
-        main(["new", str(tmp_path / name)])
-    assert not list(tmp_path.iterdir())

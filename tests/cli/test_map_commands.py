@@ -6,11 +6,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from refusing import refused
 
 from magtwin.cli import main
 from magtwin.field.grid import Grid
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.maps.statistics import source_files
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.usd.maps.layer import load_map, save_map
 
@@ -64,15 +64,6 @@ def told(capsys, *arguments):
     return json.loads(capsys.readouterr().out)
 
 
-def refused(capsys, *arguments):
-    with pytest.raises(SystemExit) as stop:
-        main(list(map(str, arguments)))
-    assert stop.value.code == 1
-    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("  ")]
-    assert len(lines) == 1
-    return lines[0]
-
-
 def test_info_tells_everything_that_a_map_knows(layer, capsys):
     said = told(capsys, "map", "info", layer)
     figures, metadata = said["figures"], said["metadata"]
@@ -81,24 +72,15 @@ def test_info_tells_everything_that_a_map_knows(layer, capsys):
     assert figures["height"] == {"value": 0.35, "unit": "m", "note": "of the sensor above the floor"}
     assert figures["dipoles"] == {"value": 2, "note": "0.5 to 0.8 m below the floor"}
     assert figures["hard iron"]["value"] == 500
-    assert figures["hard iron"]["note"] == "(300, 0, -400)"
     assert figures["soft iron"]["value"] == pytest.approx(0.02)
     assert figures["extent"]["value"] == "x -2..2, y -1.5..1.5"
     assert metadata["files"] == {"0_map.csv": SHA, "90_map.csv": SHA[::-1]}
     assert metadata["parameters"] == {"depth_m": 0.5, "notes": ["a", 1]}
-    for name, value in (
-        ("method", "harmonic"),
-        ("frame", "world"),
-        ("datum", "the door"),
-        ("created", "2026-01-01"),
-        ("licence", "MIT"),
-        ("headings deg", "0, 90, 180, 270"),
-    ):
-        assert metadata[name] == value
-    main(["map", "info", str(layer)])
-    text = capsys.readouterr().out
-    for part in ("the door", "0_map.csv", "dipoles", "(300, 0, -400)", "parameters", "depth_m  0.5"):
-        assert part in text
+    about = {"method": "harmonic", "frame": "world", "datum": "the door", "created": "2026-01-01"}
+    assert (
+        about.items() | {("licence", "MIT"), ("headings deg", "0, 90, 180, 270")}
+        <= {name: value for name, value in metadata.items() if isinstance(value, str)}.items()
+    )
 
 
 def test_info_works_on_a_folder_of_csvs_and_tells_their_checksums(real_data, capsys):
@@ -108,11 +90,6 @@ def test_info_works_on_a_folder_of_csvs_and_tells_their_checksums(real_data, cap
     said = told(capsys, "map", "info", folder)
     assert said["metadata"]["files"] == {p.name: sha256(p) for p in folder.glob("*_map.csv")}
     assert said["figures"]["valid share"]["value"] < 97
-
-
-@pytest.mark.parametrize("source", ["", "a.csv", f"a.csv sha256:{SHA[:-1]}", f"a.csv sha256:{SHA}; by hand"])
-def test_a_source_that_is_not_all_files_with_checksums_names_none(source):
-    assert source_files(source) == {}
 
 
 def test_continue_writes_the_map_of_another_height(tmp_path, layer, capsys):
@@ -150,44 +127,9 @@ def test_diff_tells_and_draws_what_changed(tmp_path, layer, capsys):
     )
 
 
-@pytest.mark.parametrize("what", ["field", "gradient", "variance", "mask", "headings"])
-def test_plot_draws_each_quantity_as_png_and_svg(tmp_path, layer, capsys, what):
-    for suffix, head in (("png", b"\x89PNG"), ("svg", b"<?xml")):
-        out = tmp_path / f"a.{suffix}"
-        main(["map", "plot", str(layer), "--out", str(out), "--quantity", what])
-        assert out.read_bytes().startswith(head)
-
-
 def test_a_picture_of_another_kind_is_refused_before_anything_is_read(tmp_path, capsys):
     said = refused(capsys, "map", "plot", tmp_path / "gone.usdc", "--out", tmp_path / "a.jpg")
     assert "a picture ends in .png or .svg" in said
     assert "no such map" in refused(
         capsys, "map", "plot", tmp_path / "gone.usdc", "--out", tmp_path / "a.png"
     )
-
-
-def test_a_maps_own_texts_do_not_steer_the_terminal(tmp_path, capsys):
-    save_map(a_map(datum="the \x1b[31mdoor"), tmp_path / "m.usdc")
-    main(["map", "info", str(tmp_path / "m.usdc")])
-    told = capsys.readouterr().out
-    assert "\x1b" not in told
-    assert "the \\x1b[31mdoor" in told
-
-
-def test_outliers_take_one_line_and_json_lists_them(tmp_path, capsys, monkeypatch):
-    monkeypatch.delenv("COLUMNS", raising=False)  # no line is broken
-    rng = np.random.default_rng(0)
-    places = [(x / 4, y / 4) for x in range(12) for y in range(12)]
-    values = 50_000 + np.array([400 * x + 300 * y * y for x, y in places]) + rng.normal(0, 5, len(places))
-    values[[40, 77, 101]] += [4_000, -3_000, 2_500]
-    rows = [f"{x},{y},0,{b:.1f}" for (x, y), b in zip(places, values, strict=True)]
-    (tmp_path / "survey.csv").write_text("\n".join(["x,y,heading,field", *rows]) + "\n")
-    command = ["map", "import", str(tmp_path / "survey.csv"), "--out"]
-    main([*command, str(tmp_path / "a.parquet"), "--json"])
-    report = json.loads(capsys.readouterr().out)
-    listed = report["metadata"]["outliers"]
-    assert len(listed) == report["figures"]["outliers"]["value"] >= 3
-    main([*command, str(tmp_path / "b.parquet")])
-    lines = [line for line in capsys.readouterr().out.splitlines() if " nT at (" in line]
-    assert len(lines) == 1
-    assert lines[0].endswith(f"left in; the largest: {listed[0]}; --json lists {len(listed)}")

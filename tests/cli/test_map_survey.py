@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from magtwin.cli import main
-from magtwin.field.survey.saved import load_readings
 from magtwin.files.file import sha256
 from magtwin.usd.maps.layer import load_map
 
@@ -52,24 +51,3 @@ def test_one_seed_gives_one_file_with_any_jobs_and_another_another(lab_scene, tm
     a, b, c = ((tmp_path / name / "m.usdc").read_bytes() for name in "abc")
     assert a == b
     assert a != c
-
-
-def test_a_survey_becomes_readings_whose_headings_deviate(lab_scene, tmp_path):
-    out = tmp_path / "survey.parquet"
-    run(
-        lab_scene,
-        "--out",
-        out,
-        "--spacing-m",
-        0.5,
-        "--heading-error-deg",
-        7,
-        "--position-error-m",
-        0.01,
-        "--height-m",
-        0.2,
-    )
-    read = load_readings(out)
-    off = np.degrees(read.yaw - np.asarray(read.grid.headings_rad)[read.node[:, 0]])
-    assert off.std() == pytest.approx(7, rel=0.15)
-    assert (len(read), read.height_m, read.name) == (416, 0.2, "survey")

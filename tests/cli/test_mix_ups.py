@@ -5,8 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from magtwin.files.kinds import ACCEPTED, kind_of
-
 TAKES = {
     "room.toml": "magtwin scene room.toml",
     "suite.toml": "magtwin bench suite.toml",
@@ -42,43 +40,21 @@ TAKES = {
 }
 """What the refusal of each file names."""
 
-RARE = {
-    "run.csv",
-    "cart",
-    "controllers.yaml",
-    "floor.yaml",
-    "metadata.yaml",
-    "mesh.stl",
-    "world.sdf",
-    "data.zip",
-    "drive.bag",
-}
+RARE = {"run.csv", "cart", "controllers.yaml", "floor.yaml", "metadata.yaml", "mesh.stl", "world.sdf"}
+RARE |= {"data.zip", "drive.bag"}
 """Files that are tried with a few commands only: what they are decides, not the command."""
 
-FEW = (
-    "run FILE",
-    "scene FILE --out new",
-    "robot FILE --out new",
-    "info FILE",
-    "map import FILE --out new.parquet",
-)
+FEW = ("run FILE", "scene FILE --out new", "robot FILE --out new", "info FILE")
 """Those commands."""
 
 RUNS = {"run.npz", "run.parquet", "run.csv", "map.usdc", "model.json"}
 """Files that a reader of runs opens: stages and JSON may hold one."""
 
+TABLES = {"run.npz", "run.parquet", "run.csv", "commands.csv", "path.csv"}
 SLOTS = {
     "run FILE": {"map.usdc", "room", "cart"},
     "sweep FILE --out new": {"map.usdc", "room", "cart"},
-    "map import FILE --out new.parquet": {
-        "run.npz",
-        "run.parquet",
-        "run.csv",
-        "survey",
-        "drives",
-        "commands.csv",
-        "path.csv",
-    },
+    "map import FILE --out new.parquet": TABLES | {"survey", "drives"},
     "map survey FILE --out new.usdc": {"map.usdc", "room", "cart"},
     "export FILE --out new": {"map.usdc", "room", "cart"},
     "run lab --path FILE --out new": RUNS | {"path.csv", "commands.csv"},
@@ -122,28 +98,6 @@ def test_a_file_of_another_kind_is_refused_with_what_takes_it(slot, files, refus
         if name.endswith((".toml", ".urdf")):
             assert TAKES[name] in line or "author it first" in line or "--out" in line, (slot, line)
     assert sorted(os.listdir()) == before
-
-
-def test_each_kind_is_recognised_and_taken_by_a_reader(files):
-    known = {name: kind_of(files / name) for name in TAKES}
-    assert None not in known.values()
-    taken = {kind for kinds in ACCEPTED.values() for kind in kinds}
-    made = {known[name] for name in TAKES} - taken
-    assert {kind.noun for kind in made} == {
-        "a Python file",
-        "a bag of ROS 1",
-        "a page",
-        "a picture or film",
-        "a network as ONNX, which runs without magtwin",
-        "the folder of a scene",
-        "the folder of a robot",
-        "a YAML",
-        "an occupancy map of map_server",
-        "the description of a bag",
-        "a mesh",
-        "a world or model of Gazebo",
-        "an archive",
-    }
 
 
 @pytest.mark.parametrize("slot", SLOTS)

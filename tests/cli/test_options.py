@@ -123,17 +123,8 @@ def test_help_imports_nothing_but_what_prints_it():
 def test_an_output_may_have_the_name_of_a_choice(lab_scene, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     run = ["run", str(lab_scene), "--path", "sine", "--duration-s", "0.5", "--out", "sine", "--quiet"]
-    localize = [
-        "localize",
-        "sine/run.parquet",
-        "--map",
-        "lab",
-        "--method",
-        "odometry",
-        "--out",
-        "odometry",
-        "--quiet",
-    ]
+    localize = ["localize", "sine/run.parquet", "--map", "lab", "--method", "odometry", "--quiet"]
+    localize += ["--out", "odometry"]
     for words in (run, localize, [*run, "--force"], [*localize, "--force"]):
         main(words)
     shutil.copytree(lab_scene.parent, "room")

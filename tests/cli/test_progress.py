@@ -3,24 +3,18 @@
 import io
 import json
 import os
-import pty
 import re
 import subprocess
 import sys
 import threading
 import time
 from contextlib import suppress
-from itertools import pairwise
-from pathlib import Path
 
 import pytest
 from waiting import wait_until
 
-import magtwin
 from magtwin.cli import main
-from magtwin.cli.progress import EVERY_S, FIRST_S, Step, Watch, in_words, step, watched
-
-ROOT = Path(magtwin.__file__).parents[1]
+from magtwin.cli.progress import EVERY_S, FIRST_S, Step, Watch, step, watched
 
 
 class Clock:
@@ -68,37 +62,6 @@ def test_the_first_line_comes_within_2_s_and_the_next_ones_every_10_s(watch, clo
     assert stream.getvalue().splitlines()[0] == "  Starting: 2 s so far"
 
 
-def test_lines_come_at_most_every_10_s_however_many_steps_and_reports_there_are(watch, clock, stream):
-    times = []
-    for k in range(1000):  # 100 s
-        clock.now += 0.1
-        before = stream.getvalue()
-        if k % 30 == 0:
-            watch.step(f"Step {k}", announced=False)
-        with watch.progress("Driving", "runs") as advance:
-            advance(k, 1000)
-        if stream.getvalue() != before:
-            times.append(clock.now)
-    assert len(times) == 10
-    assert min(b - a for a, b in pairwise(times)) >= 10
-
-
-def test_a_command_of_less_than_2_s_prints_no_progress(watch, clock, stream):
-    with watch.progress("Driving", "runs") as advance:
-        for k in range(14):
-            clock.now += 0.1
-            advance(k, 14)
-    assert stream.getvalue() == ""
-
-
-def test_a_line_tells_counts_rate_and_time_left(watch, clock, stream):
-    with watch.progress("Training", "rows") as advance:
-        for k in range(17):
-            clock.now = 0.1 * k + 0.01
-            advance(1000 * k, 100_000, "epoch 1 of 12")
-    assert stream.getvalue() == "  Training: 15,000 of 100,000 rows, 10,000 rows/s, 8 s left, epoch 1 of 12\n"
-
-
 @pytest.mark.parametrize(
     ("reports", "now", "said"),
     [
@@ -130,27 +93,6 @@ def test_an_unknown_length_tells_the_time_that_has_gone(watch, clock, stream):
         "  Drawing the stage: 2 s so far",
         "  Recording: 2,100 messages, 200 messages/s, 10 s so far",
     ]
-
-
-def test_seconds_are_told_as_a_share_of_real_time():
-    one = Step("Simulating", "s", 0.0)
-    one.advance(0, 0, 60)
-    one.advance(10, 5, 60)
-    assert one.line(10.0) == "Simulating: 5 of 60 s, 0.5 x real time, 1 min 50 s left"
-    assert [in_words(s) for s in (0.4, 59.6, 80, 7500)] == ["0 s", "1 min 0 s", "1 min 20 s", "2 h 5 min"]
-
-
-def test_nothing_is_printed_while_a_viewer_is_shown(watch, clock, stream):
-    with watch.silence():
-        clock.now = 100.0
-        watch.tick()
-    assert stream.getvalue() == ""
-    clock.now = 101.0
-    watch.tick()
-    assert stream.getvalue() == ""
-    clock.now = 102.0
-    watch.tick()
-    assert stream.getvalue().startswith("  Starting")
 
 
 def test_a_thread_prints_what_a_library_without_a_hook_takes_long_for(capsys):
@@ -208,22 +150,6 @@ def test_output_that_nobody_reads_to_its_end_gives_status_141_and_no_text(words)
     assert all(line.startswith("  ") for line in done.stderr.splitlines())  # progress, on a slow machine
 
 
-def test_columns_says_how_wide_piped_reports_are(long_run, monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", "50")
-    main(["info", str(long_run)])
-    assert max(map(len, capsys.readouterr().out.splitlines())) <= 50
-
-
-def test_piped_help_has_a_line_an_option(piped):
-    out = piped("run", "--help").out
-    options = [line for line in out.splitlines() if line.startswith("  --path")]
-    assert len(options) == 1
-    assert options[0].count("curvilinear_2") == 1
-    assert not re.search(r" +$", out, re.M)
-    for words in (["run", "--help"], ["--help"], [], ["map", "--help"], ["ros"]):
-        assert "─" not in piped(*words).out, words
-
-
 def test_json_stays_json_while_progress_goes_to_stderr(long_run, monkeypatch, capsys):
     from magtwin.io import info
 
@@ -235,34 +161,3 @@ def test_json_stays_json_while_progress_goes_to_stderr(long_run, monkeypatch, ca
     assert re.match(r"  Reading a-long.*( \.\.\.|: [1-9] s so far)\n", error)
     main(["info", str(long_run), "--quiet"])
     assert capsys.readouterr() == ("", "")
-
-
-def test_on_a_terminal_there_is_a_bar_with_rate_and_time_left(tmp_path):
-    code = """
-import time
-from magtwin.cli.progress import watched, progress
-with watched():
-    with progress("Driving", "runs") as advance:
-        for k in range(41):
-            advance(k, 40, "lap")
-            time.sleep(0.02)
-print("the end")
-"""
-    parent, child = pty.openpty()
-    env = os.environ | {"PYTHONPATH": str(ROOT), "TERM": "xterm", "COLUMNS": "100"}
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=child, env=env)
-    os.close(child)
-    shown = b""
-    while True:
-        try:
-            block = os.read(parent, 4096)
-        except OSError:
-            break
-        if not block:
-            break
-        shown += block
-    assert process.communicate()[0] == b"the end\n"
-    os.close(parent)
-    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.decode())
-    assert re.search(r"  Driving ━.* 40/40 .*runs/s 0:00:00 lap", text)
-    assert "so far" not in text

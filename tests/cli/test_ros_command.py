@@ -1,6 +1,7 @@
 """`magtwin ros`: nodes from the command line, and one line where they cannot be."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -22,16 +23,6 @@ def here(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.setenv("ROS_DOMAIN_ID", str(next(DOMAINS)))
     monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
-
-
-def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """What is said in one line where an input is refused."""
-    with pytest.raises(SystemExit) as ended:
-        main(["ros", *arguments])
-    assert ended.value.code == 1
-    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("  ")]
-    assert len(lines) == 1
-    return lines[0]
 
 
 def test_a_robot_is_simulated_for_a_while(capsys: pytest.CaptureFixture[str]) -> None:
@@ -56,9 +47,8 @@ def test_the_localizer_waits_for_a_robot_and_runs_any_method(
     assert "localizing by cyclonedds" in capsys.readouterr().err
 
 
-def test_a_recording_of_nothing_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = refused(["record", str(tmp_path / "bag"), "--duration-s", "0.1"], capsys)
-    assert "nothing was recorded" in said
+def test_a_recording_of_nothing_is_said(tmp_path: Path, refusal: Callable[..., str]) -> None:
+    assert "nothing was recorded" in refusal("ros", "record", tmp_path / "bag", "--duration-s", "0.1")
     assert not list(tmp_path.iterdir())
 
 
@@ -101,13 +91,5 @@ def test_a_named_topic_that_was_not_recorded_ends_with_status_1_and_the_others_a
         (["follow", "figure8", "--speed", "3"], "--speed must be above 0"),
     ],
 )
-def test_what_cannot_be_is_one_line(
-    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert said in refused(arguments, capsys)
-
-
-def test_what_exists_is_not_recorded_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "bag").mkdir()
-    said = refused(["record", str(tmp_path / "bag"), "--duration-s", "0.1"], capsys)
-    assert "--force" in said
+def test_what_cannot_be_is_one_line(arguments: list[str], said: str, refusal: Callable[..., str]) -> None:
+    assert said in refusal("ros", *arguments)

@@ -65,13 +65,6 @@ def card_of(weights):
     return " ".join(weights.with_suffix(".md").read_text().split())
 
 
-def refused(capsys, *words):
-    with pytest.raises(SystemExit) as ended:
-        main([str(word) for word in words])
-    assert ended.value.code == 1
-    return capsys.readouterr().err.splitlines()[-1]
-
-
 def test_the_card_tells_checksum_errors_by_path_and_how_to_repeat(trained):
     card = trained.with_suffix(".md").read_text()
     assert sha256(trained) in card
@@ -216,43 +209,6 @@ def test_the_configuration_of_any_kind_repeats_its_weights_to_the_byte(data, kin
     assert again.read_bytes() == kinds[kind][0].read_bytes()
 
 
-def test_a_model_that_is_fitted_at_once_has_no_learning_curve(kinds):
-    beside = sorted(path.name for path in kinds["linear"][0].parent.glob("linear.*"))
-    assert beside == ["linear.md", "linear.safetensors"]
-    assert kinds["hybrid"][0].with_suffix(".png").exists()
-
-
-def test_a_hybrid_says_whether_its_network_was_kept_and_both_figures(kinds):
-    out, printed = kinds["hybrid"]
-    hybrid, figures = load_predictor(out), printed["figures"]
-    base, whole = (figures[name]["value"] for name in ("base alone MAE", "with network MAE"))
-    assert (hybrid.net is not None) == (whole < base) == (figures["network"]["value"] == "kept")
-    assert f"the base alone errs by {base:.1f} nT, with the network by {whole:.1f} nT" in card_of(out)
-
-
-@pytest.mark.parametrize("bent", [True, False])
-def test_a_hybrid_keeps_its_network_only_where_the_base_leaves_something(tmp_path, bent):
-    runs = {name: a_run(i, "eight") for i, name in enumerate("abcdefg")}
-    for name, run in runs.items():
-        speed = run["odom_v"][:, 0]
-        field = run["b_measured_nt"] + (300 * np.abs(speed) if bent else 0)
-        runs[name] = run.with_columns(b_measured_nt=field)
-    build_dataset(runs, HILLS, tmp_path / "set")
-    options = {
-        "features": "odom_v_x,imu_w_z",
-        "layers": (16,),
-        "epochs": 8,
-        "batch": 32,
-        "lr": 0.02,
-        "seed": 3,
-    }
-    mt.train(tmp_path / "set", out=tmp_path / "h.safetensors", model="hybrid", **options)
-    metadata = load_predictor(tmp_path / "h.safetensors").metadata
-    assert metadata["network"] == ("kept" if bent else "left out")
-    if bent:
-        assert metadata["test_mae_nt"] < 0.5 * metadata["test_ridge_mae_nt"]
-
-
 def test_a_linear_model_goes_on_from_another(data, kinds):
     result = mt.train(data, model="linear", init=kinds["linear"][0], penalty=1e9)
     before = load_predictor(kinds["linear"][0])
@@ -281,15 +237,15 @@ def test_a_gpu_that_is_not_there_is_refused_and_auto_takes_the_cpu(data, kinds):
         (["--out", "DATA/f.onnx"], "a network ends in .safetensors"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_trained_is_refused_and_writes_nothing(data, kinds, tmp_path, capsys, words, text):
+def test_what_cannot_be_trained_is_refused_and_writes_nothing(data, kinds, tmp_path, refusal, words, text):
     folders = {"KINDS": str(kinds["linear"][0].parent), "DATA": str(data)}
     words = [re.sub("^(KINDS|DATA)", lambda found: folders[found[1]], word) for word in words]
     out = [] if "--out" in words else ["--out", str(tmp_path / "f.safetensors")]
-    assert text in refused(capsys, "train", data, *out, *words)
+    assert text in refusal("train", data, *out, *words)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_files_beside_the_weights_are_not_written_over(data, tmp_path, capsys):
+def test_files_beside_the_weights_are_not_written_over(data, tmp_path, refusal):
     (tmp_path / "f.png").write_text("mine")
-    said = refused(capsys, "train", data, "--out", tmp_path / "f.safetensors")
+    said = refusal("train", data, "--out", tmp_path / "f.safetensors")
     assert "f.png: exists already; give --force" in said

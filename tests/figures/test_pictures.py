@@ -3,12 +3,10 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from magtwin.errors import InputError
-from magtwin.figures.pictures import BACKGROUND, VEIL, Camera, picture_of_stage, view_distance
+from magtwin.figures.pictures import BACKGROUND, VEIL, Camera, picture_of_stage
 from magtwin.usd.geometry import srgb_from_linear
 from magtwin.usd.info import info_of_stage
 
@@ -144,17 +142,6 @@ def test_no_wall_or_column_hides_the_map_from_any_side(
     assert changed[0].max() <= VEIL * 255 + 3
     there = ~drawn(bare)
     np.testing.assert_allclose(veiled[there], solid[there], atol=8)  # solid elsewhere; drawn() sees from 8 on
-
-
-@given(
-    st.lists(st.tuples(*[st.floats(-2, 2)] * 3), min_size=1, max_size=8),
-    st.tuples(st.floats(0.1, 0.8), st.floats(0.1, 0.8)),
-)
-def test_at_the_view_distance_all_points_are_within_the_angles_and_one_is_on_the_edge(points, half):
-    D = view_distance(points, [0, 0, 0], np.eye(3), half)
-    r, u, b = np.array(points).T
-    outside = np.maximum(np.abs(r) - (D - b) * np.tan(half[0]), np.abs(u) - (D - b) * np.tan(half[1]))
-    np.testing.assert_allclose(outside.max(), 0, atol=1e-9)
 
 
 def test_what_cannot_be_drawn_is_refused(stage, tmp_path):

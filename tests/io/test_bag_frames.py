@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from magtwin.errors import MismatchWarning, RepairWarning
 from magtwin.io.bags import read_bag
-from magtwin.io.bags.frames import StaticFrames, kind_of
+from magtwin.io.bags.frames import StaticFrames
 from magtwin.io.surveys.readings import read_readings
 from magtwin.run.run import Run
 from magtwin.tasks.localizing import check_lever_arm
@@ -132,24 +132,6 @@ def test_the_pose_of_a_camera_whose_place_is_unknown_is_warned_of(tmp_path):
 def test_names_of_robots_in_use_pass_without_a_warning(tmp_path, child):
     topics = drive(child=child, frame="") | static(("base_footprint", "base_link", [0, 0, 0.01], UPRIGHT))
     assert " of /pose" not in both(record(tmp_path / "a.mcap", topics))[1].source
-
-
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        ("map", "fixed"),
-        ("camera_odom_frame", "fixed"),
-        ("ann/odom", "fixed"),
-        ("base_link", "base"),
-        ("/ann/base_footprint", "base"),
-        ("base_laser", "part"),
-        ("camera1_optical_frame", "part"),
-        ("gripper_link", "part"),
-        ("turtlebot", ""),
-    ],
-)
-def test_frames_are_known_by_the_words_of_their_names(name, kind):
-    assert kind_of(name) == kind
 
 
 def test_a_ring_of_transforms_or_a_damaged_one_ends_no_reader():

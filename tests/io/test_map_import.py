@@ -5,9 +5,7 @@ import json
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from recordings import record
 from refusing import refused
-from test_recorded import poses, readings
 from test_stuck import gridded
 
 from magtwin.author.earth import earth_of
@@ -66,20 +64,8 @@ def test_readings_kept_as_parquet_make_the_same_layer_as_the_folder_and_keep_wha
 
 def test_a_table_becomes_a_file_of_readings_by_its_column_names(tmp_path, capsys):
     (tmp_path / "a.csv").write_text("px,py,deg,b\n0,0,10,41\n1,0,20,42\n")
-    columns = (
-        "--x",
-        "px",
-        "--y",
-        "py",
-        "--heading",
-        "deg",
-        "--heading-unit",
-        "deg",
-        "--field",
-        "b",
-        "--unit",
-        "uT",
-    )
+    columns = ["--x", "px", "--y", "py", "--heading", "deg", "--heading-unit", "deg"]
+    columns += ["--field", "b", "--unit", "uT"]
     run("map", "import", tmp_path / "a.csv", "--out", tmp_path / "a.parquet", *columns, "--json")
     figures = json.loads(capsys.readouterr().out)["figures"]
     assert figures["readings"]["value"] == 2
@@ -88,42 +74,56 @@ def test_a_table_becomes_a_file_of_readings_by_its_column_names(tmp_path, capsys
     assert_allclose(readings.yaw, np.radians([10, 20]))
 
 
-def test_a_bag_becomes_readings_by_the_command(tmp_path, capsys):
-    bag = record(tmp_path / "bag", {"/pose": poses(), "/slam": poses(), "/mag": readings()})
-    run("map", "import", bag, "--out", tmp_path / "a.parquet", "--pose-topic", "/pose")
-    assert "field /mag" in capsys.readouterr().out
-    assert len(load_readings(tmp_path / "a.parquet")) == 198
+REFUSED = [
+    ("import a.csv --x px", "no column 'px'; did you mean 'x'"),
+    ("import a.csv --vector a,b", "vector takes 3 columns"),
+    ("import a.csv --unit uT", "give --unit nT"),
+    ("import m.usdc", "m.usdc: is a USD file, not a source of readings"),
+    ("import b.csv", "b.csv: no such source of readings"),
+    ("import a.csv+b.csv", "b.csv: no such file of readings"),
+    ("import a.csv --out a.txt", "ends in .usdc"),
+    ("import a.csv --out a.usdc", "not gridded", "magtwin map fit"),
+    ("import a.csv --created yesterday", "--created must be a day YYYY-MM-DD"),
+    ("import a.csv --height-m -1", "--height-m", "0 m or more, got -1"),
+    ("import a.csv --height-m nan", "--height-m", "got nan"),
+    ("fit a.csv", "2 of 2 readings are good", "needs 8"),
+    ("fit a.csv --headings-deg north", "headings are degrees"),
+    ("fit a.csv --headings-deg 0,nan", "headings are degrees"),
+    ("fit a.csv --method cubic --kernel matern", "--kernel is for --method gp; drop it"),
+    ("fit a.csv --method gp --earth 20000,0,-40000", "--earth is for --method harmonic; drop it"),
+    ("fit a.csv --earth 1,2,south", "--earth is a scene; latitude"),
+    ("fit a.csv --earth 0,0,0", "earth_nt must be three numbers"),
+    ("fit a.csv --earth 29.65,-82.35,50", "is a field of 100.8 nT"),
+    ("fit a.csv --earth 29,-82,50,2050-01-01", "lies beyond the IGRF-14"),
+    ("fit a.csv --earth lab.usda", "no file 'lab.usda'"),
+    ("fit none.csv", "--heading none"),
+    ("fit deg.csv", "--heading-unit deg"),
+    ("fit uv.csv", "--x NAME --y NAME"),
+    ("fit strength.csv", "--field NAME", "magtwin map import strength.csv"),
+]
+"""Commands below `magtwin map`, and words of their refusals."""
+
+SOURCES = {
+    "a.csv": "x,y,yaw,field\n0,0,0,41000\n1,0,0,41500\n",
+    "none.csv": "x,y,field\n0,0,41000\n",
+    "deg.csv": "x,y,yaw,field\n0,0,90,41000\n",
+    "uv.csv": "u,v,yaw,field\n0,0,0,41000\n",
+    "strength.csv": "x,y,yaw,strength\n0,0,0,41000\n",
+    "m.usdc": "PXR-USDC",
+}
 
 
-def test_scattered_readings_make_no_nodes_and_the_way_on_is_told(tmp_path, capsys):
-    (tmp_path / "a.csv").write_text("x,y,yaw,field\n0,0,0,41000\n1,0,0,41500\n")
-    line = refused(capsys, "map", "import", tmp_path / "a.csv", "--out", tmp_path / "a.usdc")
-    assert "survey 'a' is not gridded" in line
-    assert "magtwin map fit" in line
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "what"),
-    [
-        (("a.csv", "--x", "px"), "no column 'px'; did you mean 'x'"),
-        (("a.csv", "--vector", "a,b"), "vector takes 3 columns"),
-        (("a.csv", "--unit", "uT"), "give --unit nT"),
-        (("m.usdc",), "m.usdc: is a USD file, not a source of readings"),
-        (("b.csv",), "b.csv: no such source of readings"),
-        (("a.csv+b.csv",), "b.csv: no such file of readings"),
-        (("a.csv", "--out", "a.txt"), "ends in .usdc or .usd or .parquet"),
-    ],
-)
-def test_what_cannot_be_imported_is_refused_in_one_line_and_nothing_is_written(
-    tmp_path, monkeypatch, capsys, arguments, what
-):
+@pytest.mark.parametrize(("command", "words"), [(c, w) for c, *w in REFUSED], ids=lambda x: str(x)[:50])
+def test_what_makes_no_readings_or_map_is_refused_in_one_line(tmp_path, monkeypatch, capsys, command, words):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "a.csv").write_text("x,y,yaw,field\n0,0,0,41000\n1,0,0,41500\n")
-    (tmp_path / "m.usdc").write_text("PXR-USDC")
-    out = () if "--out" in arguments else ("--out", "a.parquet")
-    assert what in refused(capsys, "map", "import", *arguments, *out)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv", "m.usdc"]
+    for name, text in SOURCES.items():
+        (tmp_path / name).write_text(text)
+    arguments = command.split()
+    if "--out" not in arguments:
+        arguments += ["--out", "new.parquet" if arguments[0] == "import" else "new.usdc"]
+    line = refused(capsys, "map", *arguments)
+    assert all(word in line for word in words), line
+    assert {p.name for p in tmp_path.iterdir()} == SOURCES.keys()
 
 
 def test_a_survey_whose_sensor_was_stuck_throughout_is_refused_unless_it_is_to_be_kept(tmp_path, capsys):
@@ -155,50 +155,6 @@ def test_repeats_of_a_fast_logger_are_counted_and_a_fit_that_lacks_readings_name
     assert "5 of 60 readings are good, 55 are masked as stuck (--keep-stuck keeps them)" in line
 
 
-@pytest.mark.parametrize("headings", ["", "north", "0,nan", "0;90"])
-def test_headings_that_are_none_are_refused(tmp_path, capsys, headings):
-    save_readings(gridded(0), tmp_path / "a.parquet")
-    arguments = (
-        "map",
-        "fit",
-        tmp_path / "a.parquet",
-        "--out",
-        tmp_path / "a.usdc",
-        "--headings-deg",
-        headings,
-    )
-    assert "headings are degrees with commas between" in refused(capsys, *arguments)
-
-
-@pytest.mark.parametrize(
-    ("text", "flags"),
-    [
-        ("x,y,field\n0,0,41000\n", "--heading none"),
-        ("x,y,yaw,field\n0,0,90,41000\n", "--heading-unit deg"),
-        ("u,v,yaw,field\n0,0,0,41000\n", "--x NAME --y NAME"),
-        ("x,y,yaw,strength\n0,0,0,41000\n", "--field NAME"),
-    ],
-)
-def test_a_fit_of_a_table_that_must_be_told_names_the_import_to_type(tmp_path, capsys, text, flags):
-    (tmp_path / "a b.csv").write_text(text)
-    line = refused(capsys, "map", "fit", tmp_path / "a b.csv", "--out", tmp_path / "m.usdc")
-    assert line.endswith(f"magtwin map import '{tmp_path}/a b.csv' {flags} --out 'a b.parquet'")
-
-
-@pytest.mark.parametrize(
-    ("said", "why"),
-    [
-        (("--created", "yesterday"), "--created must be a day YYYY-MM-DD, got 'yesterday'"),
-        (("--height-m", "-1"), "--height-m of Readings is a height above the floor, 0 m or more, got -1.0"),
-        (("--height-m", "nan"), "--height-m of Readings is a height above the floor, 0 m or more, got nan"),
-    ],
-)
-def test_a_day_or_a_height_that_is_none_is_refused(tmp_path, capsys, real_data, said, why):
-    maps = real_data / "aprilab/maps"
-    assert why in refused(capsys, "map", "import", maps, "--out", tmp_path / "a.usdc", *said)
-    assert not (tmp_path / "a.usdc").exists()
-
-
 def test_the_earths_field_is_taken_from_a_place_and_day_as_numbers_or_from_a_scene(lab_scene):
     place = earth_of("29.64, -82.35, 50, 2024-06-01")
     assert place == earth_field_nt(29.64, -82.35, 50.0, "2024-06-01")
@@ -210,52 +166,6 @@ def test_a_survey_of_a_twin_knows_the_earths_field_and_keeps_it(tmp_path, capsys
     out = tmp_path / "a.parquet"
     run("map", "survey", lab_scene, "--out", out, "--spacing-m", "1", "--readings", "1")
     assert load_readings(out).earth_nt == read_scene(lab_scene, check_network=False).earth.b_world_nt
-
-
-@pytest.mark.parametrize(
-    ("arguments", "what"),
-    [
-        (("--method", "cubic", "--kernel", "matern"), "--kernel is for --method gp; drop it"),
-        (("--method", "gp", "--earth", "20000,0,-40000"), "--earth is for --method harmonic; drop it"),
-        (("--earth", "1,2,south"), "--earth is a scene; latitude,longitude,height,date; or x,y,z in nT"),
-        (("--earth", "0,0,0"), "earth_nt must be three numbers"),
-        (
-            ("--earth", "29.65,-82.35,50"),
-            "is a field of 100.8 nT, and the Earth's is some 22,000 to 67,000",
-        ),
-        (("--earth", "29,-82,50,2050-01-01"), "lies beyond the IGRF-14"),
-        (("--earth", "lab.usda"), "there is no file 'lab.usda'"),
-    ],
-)
-def test_an_option_of_another_method_and_a_field_that_is_none_are_refused(
-    tmp_path, monkeypatch, capsys, arguments, what
-):
-    monkeypatch.chdir(tmp_path)
-    assert what in refused(capsys, "map", "fit", "a.csv", "--out", "a.usdc", *arguments)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_fit_of_one_heading_and_of_few_readings_says_that_they_are_doubtful(tmp_path, capsys):
-    rows = "".join(f"{x},{y},0.5,{41 + 0.1 * x * y:.3f}\n" for x in range(4) for y in range(4))
-    (tmp_path / "hall.csv").write_text("x,y,heading,field\n" + rows)
-    run(
-        "map",
-        "fit",
-        tmp_path / "hall.csv",
-        "--method",
-        "gp",
-        "--spacing-m",
-        "0.5",
-        "--out",
-        tmp_path / "z.usdc",
-    )
-    said = " ".join(capsys.readouterr().out.split())
-    assert "only 16 good readings" in said
-    assert (
-        "one heading only, 29 deg: unless the sensor was carried by hand, the robot's own field cannot"
-        in said
-    )
-    assert "field in uT, by its size (--unit)" in said
 
 
 def test_vectors_and_headings_that_contradict_each_other_are_a_doubt(tmp_path, capsys):
@@ -270,11 +180,3 @@ def test_vectors_and_headings_that_contradict_each_other_are_a_doubt(tmp_path, c
     assert doubt.startswith("vectors keep no direction in world axes (")
     (fitted,) = vector_doubts(load_readings(tmp_path / "a.parquet"))
     assert fitted == doubt
-
-
-def test_too_few_readings_are_no_map(tmp_path, capsys):
-    rows = "".join(f"{x},{x % 2},{x},41000\n" for x in range(7))
-    (tmp_path / "hall.csv").write_text("x,y,heading,field\n" + rows)
-    with pytest.raises(SystemExit):
-        run("map", "fit", tmp_path / "hall.csv", "--out", tmp_path / "z.usdc")
-    assert "hall.csv: 7 of 7 readings are good; a map needs 8 at least" in capsys.readouterr().err

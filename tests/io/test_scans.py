@@ -46,11 +46,6 @@ def test_in_the_lab_every_scan_sees_the_walls_all_round(twin, run, scans):
     assert lidar[0] == pytest.approx(0.19, abs=0.02)
 
 
-def test_one_seed_gives_one_draw_of_noise(twin, run, scans):
-    assert_array_equal(scan(twin, run).ranges_m, scans.ranges_m)
-    assert not np.array_equal(scan(twin, run, seed=1).ranges_m, scans.ranges_m)
-
-
 def test_a_table_of_scans_comes_back_to_the_bit_and_is_written_alike(scans, tmp_path):
     write_scans(scans, tmp_path / "a.parquet")
     write_scans(read_scans(tmp_path / "a.parquet"), tmp_path / "b.parquet")

@@ -102,16 +102,11 @@ def test_a_survey_given_twice_counts_once(tmp_path):
 
 @pytest.mark.parametrize(
     ("value", "said", "wanted"),
-    [
-        ("41", "nT", "uT"),
-        ("4.1e-5", "nT", "T"),
-        ("0.41", "nT", "G"),
-        ("41000", "T", "nT"),
-    ],
+    [("41", "nT", "uT"), ("4.1e-5", "nT", "T"), ("0.41", "nT", "G"), ("41000", "T", "nT")],
 )
 def test_a_mistaken_unit_is_refused_by_the_one_that_would_fit(tmp_path, value, said, wanted):
     path = file(tmp_path, f"x,y,yaw,field\n0,0,0,{value}\n")
-    with pytest.raises(InputError, match=f"a.csv: the median of field .* in {wanted} .*--unit {wanted}$"):
+    with pytest.raises(InputError, match=f"--unit {wanted}$"):
         read_readings(path, columns=Columns(unit=said))
 
 
@@ -126,35 +121,22 @@ def test_a_unit_that_is_not_given_follows_from_the_size_and_is_told(tmp_path, va
     assert (told in readings.source) == (unit != "nT")
 
 
-@pytest.mark.parametrize(
-    "header",
-    [
-        f"Timestamp,x,y,Yaw,{name}"
-        for name in (
-            "b_total",
-            "B",
-            "|B|",
-            "b_uT",
-            "Total_Field",
-            "Absolute field (\N{MICRO SIGN}T)",
-            "TMI [uT]",
-        )
-    ]
-    + [
-        "t,p_world_base_x,p_world_base_y,yaw,BT",
-        "time_ms,pos_x,pos_y,theta,field_ut",
-        "t,pose.x,pose.y,yaw,mag",
-    ]
-    + [
-        "Time (s);Rechtswert [m];Hochwert [m];heading;Feldst\u00e4rke [\u00b5T]",
-        "t,Easting (m),Northing (m),yaw,F",
-    ],
-)
+NAMES = ("b_total", "B", "|B|", "b_uT", "Total_Field", "Absolute field (\N{MICRO SIGN}T)", "TMI [uT]")
+HEADERS = [
+    *(f"Timestamp,x,y,Yaw,{name}" for name in NAMES),
+    "t,p_world_base_x,p_world_base_y,yaw,BT",
+    "time_ms,pos_x,pos_y,theta,field_ut",
+    "t,pose.x,pose.y,yaw,mag",
+    "Time (s);Rechtswert [m];Hochwert [m];heading;Feldst\u00e4rke [\u00b5T]",
+    "t,Easting (m),Northing (m),yaw,F",
+]
+
+
+@pytest.mark.parametrize("header", HEADERS)
 def test_columns_are_found_by_usual_names_whatever_wrote_them(tmp_path, header):
     separator = ";" if ";" in header else ","
-    (tmp_path / "a.csv").write_text(
-        f"{header}\n{separator.join(['5500', '1', '2', '.25', '41'])}\n", encoding="cp1252"
-    )
+    row = separator.join(["5500", "1", "2", ".25", "41"])
+    (tmp_path / "a.csv").write_text(f"{header}\n{row}\n", encoding="cp1252")
     readings = read_readings(tmp_path / "a.csv")
     assert (readings.b_nt[0], readings.yaw[0]) == (41e3, 0.25)
     assert readings.p_xy.tolist() == [[1, 2]]
@@ -163,26 +145,9 @@ def test_columns_are_found_by_usual_names_whatever_wrote_them(tmp_path, header):
 
 
 @pytest.mark.parametrize(
-    ("x", "note"),
-    [
-        ((-150, 150), "over 300 m: if these are cm"),
-        ((-82.35, -82.35004), "over 0.04 mm only: if these are degrees"),
-        ((-2, 2), ""),
-    ],
-)
-def test_positions_of_an_unlikely_size_have_a_note(tmp_path, x, note):
-    text = "x,y,yaw,b\n" + "".join(f"{v},29.65,0,41000\n" for v in x)
-    assert note in "".join(taken(read_readings(file(tmp_path, text))))
-    assert not taken(read_readings(file(tmp_path, text.replace("x,", "x [m],"), "b.csv")))
-
-
-@pytest.mark.parametrize(
     ("header", "nt"),
     [
-        (
-            "Magnetic field x (\N{MICRO SIGN}T),MAGNETIC FIELD Y (uT),Magnetic field z (uT)",
-            1e3,
-        ),
+        ("Magnetic field x (\N{MICRO SIGN}T),MAGNETIC FIELD Y (uT),Magnetic field z (uT)", 1e3),
         ("/magnetic_field/x,/magnetic_field/y,/magnetic_field/z", 1e3),
         ("X_uT,Y_uT,Z_uT", 1e3),
         ("b_x_nT,b_y_nT,b_z_nT", 1),
@@ -206,19 +171,15 @@ def test_components_are_found_by_their_usual_names_where_there_is_no_magnitude(t
     assert both.b_body_nt is None, "a magnitude that is there is what is read"
 
 
+NAMED = {"t_ms": 1e3, "time_ns": 1e9, "timestamp_us": 1e6, "Time since start in ms": 1e3, "timestamp": 1}
+BY_SIZE = {"ms": 1e3, "us": 1e6, "ns": 1e9}
+NOTE = "timestamp in {} since 1970, by its size"
+
+
 @pytest.mark.parametrize(
     ("name", "ticks", "note"),
-    [
-        ("t_ms", 1e3, None),
-        ("time_ns", 1e9, None),
-        ("timestamp_us", 1e6, None),
-        ("Time since start in ms", 1e3, None),
-        ("seconds_elapsed", 1, None),
-        ("timestamp", 1, None),
-        ("timestamp", 1e3, "timestamp in ms since 1970, by its size"),
-        ("timestamp", 1e6, "timestamp in us since 1970, by its size"),
-        ("timestamp", 1e9, "timestamp in ns since 1970, by its size"),
-    ],
+    [(name, ticks, None) for name, ticks in NAMED.items()]
+    + [("timestamp", ticks, NOTE.format(unit)) for unit, ticks in BY_SIZE.items()],
 )
 @pytest.mark.parametrize("given", [False, True])
 def test_times_are_read_in_the_unit_of_their_name_or_size(tmp_path, name, ticks, note, given):
@@ -438,127 +399,47 @@ def test_damaged_metadata_is_refused(tmp_path, change):
         read_readings(tmp_path / "b.parquet")
 
 
-def test_readings_whose_columns_do_not_fit_are_refused_with_the_file(tmp_path):
-    save_readings(read_readings(file(tmp_path, ROWS)), tmp_path / "a.parquet")
-    table = pq.read_table(tmp_path / "a.parquet")
-    wrong = table.set_column(table.column_names.index("b_nt"), "b_nt", [[-1.0, 2.0, 3.0]])
-    pq.write_table(wrong, tmp_path / "b.parquet")
-    with pytest.raises(InputError, match=r"b\.parquet: b_nt of Readings is a magnitude"):
-        load_readings(tmp_path / "b.parquet")
-    pq.write_table(table.drop_columns(["yaw"]), tmp_path / "c.parquet")
-    with pytest.raises(InputError, match=r"c\.parquet: no column 'yaw'"):
-        load_readings(tmp_path / "c.parquet")
+YES = "x,y,yaw,field\n0,0,0,41000\n"
+BOTH = "x,y,yaw,field,bx,by,bz\n0,0,0,41000,12,20,-33\n1,0,0,41000,12,20,-33\n"
+QUATERNION = "x,y,a,b,c,d,field\n0,0,0,0,0,1,41000\n0,0,1,1,0,0,41000\n"
+REFUSALS = [
+    ("x [px],y,yaw,b\n0,0,0,41000\n", {}, "in no unit of x"),
+    ("x,y,yaw,field\n0,0,0,3\n", {}, "median of field is 3 nT"),
+    ("u,y,yaw,field\n0,0,0,41000\n", {}, "no column of x .*--x NAME --y NAME"),
+    ("x,y,field\n0,0,41000\n", {}, "no heading: .*--heading none"),
+    ("x,y,field\n0,0,41000\n", {"axes": "world"}, "no heading"),
+    ("x,y,yaw,strength\n0,0,0,41000\n", {}, "no column of the field .*--field NAME.*--vector BX,BY,BZ"),
+    ("x,y,bx,by,bz\n0,0,12000,20000,1\n", {}, "no heading.*--heading none; vectors in world axes"),
+    ("t,x,y,z,yaw\n0,12,20,-38,0\n", {"vector": "x,y,z"}, "'x' cannot be position and field"),
+    ("7,8,0,41\n", {"x": "1", "y": "2", "heading": "3", "field": "1"}, "column '1' cannot be"),
+    ("x,y,yaw,bx,by\n0,0,0,12,20\n", {"vector": "bx,by,bx"}, "'bx' cannot be field twice"),
+    ("x,y,z,b,px,py,yaw\n12,20,-38,44.59,0,0,0\n", {}, "x, y and z are the components of b"),
+    ("x,y,yaw,bx [uT],by [nT],bz [uT]\n0,0,0,12,20000,-38\n", {}, "units of .* differ"),
+    ("lat,lon,mag\n29.65,-82.35,46000\n", {}, "latitude and longitude"),
+    ("Lon,Lat,b,yaw\n29.65,-82.35,46000,0\n", {"x": "Lon", "y": "Lat"}, "latitude and longitude"),
+    ("time,x,y,yaw,b\n08:26:40,0,0,0,46000\n", {"time": "time"}, "csv:2: time must be .*'08:26:40'"),
+    (YES + "0,0,0,0\n", {}, "csv:3: a magnitude is above 0, got 0 nT"),
+    ("x,y,yaw,field\n0,0,0,-41000\n", {}, "csv:2: a magnitude is above 0, got -41000"),
+    (QUATERNION, {"quaternion": "a,b,c,d"}, "csv:3: a quaternion's length is 1, got 1.414"),
+    (YES + "1e308,0,0,41000\n", {}, "csv:3: x and y are metres"),
+    (BOTH, {"vector": "bx,by,bz", "field": "field"}, "0.000986 times as long as field"),
+    ("x,y,yaw,field\n0,0,0,high\n", {}, "csv:2: field must be a finite number, got 'high'"),
+    (YES, {"vector": "bx,by"}, "vector takes 3 columns"),
+    (YES, {"quaternion": "q"}, "quaternion takes 4 columns"),
+    (YES, {"quaternion": "a,b,c,d", "heading": "yaw"}, "either the heading's column or the quaternion's"),
+    (YES, {"scale": 3.0, "unit": "uT"}, "the unit of the field or its scale"),
+    (YES, {"scale": 0.0}, "scale, .* above 0, got 0"),
+    ("x,y,yaw,b\n0,0,0,0.9\n1,0,1,1.1\n", {}, "normalised sensor give --scale"),
+    ("x,y,yaw,b\n0,0,0,0.9\n1,0,1,1.1\n", {"scale": 3.0}, "--scale 50000 would make"),
+]
+"""A table, options, and words of what they are refused with."""
 
 
-REFUSALS = {
-    "x in no length": ("x [px],y,yaw,b\n0,0,0,41000\n", {}, r"a\.csv: 'x \[px\]' is in no unit of x"),
-    "no unit fits": ("x,y,yaw,field\n0,0,0,3\n", {}, r"a\.csv: the median of field is 3 nT, .*no usual unit"),
-    "missing": (None, {}, r"a\.csv: no such source of readings"),
-    "no x": ("u,y,yaw,field\n0,0,0,41000\n", {}, r"a\.csv: no column of x and of y .*--x NAME --y NAME"),
-    "no heading": (
-        "x,y,field\n0,0,41000\n",
-        {},
-        r"a\.csv: no heading: no column is called heading, yaw, theta.* carried by hand, give --heading none",
-    ),
-    "no heading, axes of no vector": ("x,y,field\n0,0,41000\n", {"axes": "world"}, r"a\.csv: no heading"),
-    "no field": (
-        "x,y,yaw,strength\n0,0,0,41000\n",
-        {},
-        r"a\.csv: no column of the field .*x, y, yaw, strength.*--field NAME, or .*--vector BX,BY,BZ",
-    ),
-    "body vector without heading": (
-        "x,y,bx,by,bz\n0,0,12000,20000,1\n",
-        {},
-        r"a\.csv: no heading.* carried by hand, give --heading none; vectors in world axes need none",
-    ),
-    "x and field at once": (
-        "t,x,y,z,yaw\n0,12,20,-38,0\n",
-        {"vector": "x,y,z"},
-        r"a\.csv: column 'x' cannot be position and field at once; name other columns with --x",
-    ),
-    "by number": ("7,8,0,41\n", {"x": "1", "y": "2", "heading": "3", "field": "1"}, "column '1' cannot be"),
-    "one component twice": (
-        "x,y,yaw,bx,by\n0,0,0,12,20\n",
-        {"vector": "bx,by,bx"},
-        r"a\.csv: column 'bx' cannot be field twice",
-    ),
-    "components as positions": (
-        "x,y,z,b,px,py,yaw\n12,20,-38,44.59,0,0,0\n",
-        {},
-        r"a\.csv: x, y and z are the components of b, no positions; name those with --x and --y",
-    ),
-    "units of components": (
-        "x,y,yaw,bx [uT],by [nT],bz [uT]\n0,0,0,12,20000,-38\n",
-        {},
-        r"a\.csv: the units of bx \[uT\],by \[nT\],bz \[uT\] differ",
-    ),
-    "places on Earth": (
-        "lat,lon,mag\n29.65,-82.35,46000\n",
-        {},
-        r"a\.csv: 'lat' and 'lon' are latitude and longitude; give x,y in metres in the axes of the lab",
-    ),
-    "places on Earth, named": (
-        "gps_Latitude,gps_Longitude,b,yaw\n29.65,-82.35,46000,0\n",
-        {"x": "gps_Longitude", "y": "gps_Latitude"},
-        r"a\.csv: 'gps_Longitude' and 'gps_Latitude' are latitude and longitude",
-    ),
-    "a time that is none": (
-        "time,x,y,yaw,b\n08:26:40,0,0,0,46000\n",
-        {"time": "time"},
-        r"a\.csv:2: time must be .* such as 2025-11-22T08:26:40; got '08:26:40'",
-    ),
-    "nought": ("x,y,yaw,field\n0,0,0,41000\n0,0,0,0\n", {}, r"a\.csv:3: a magnitude is above 0, got 0 nT"),
-    "negative": ("x,y,yaw,field\n0,0,0,-41000\n", {}, r"a\.csv:2: a magnitude is above 0, got -41000 nT"),
-    "quaternion": (
-        "x,y,a,b,c,d,field\n0,0,0,0,0,1,41000\n0,0,1,1,0,0,41000\n",
-        {"quaternion": "a,b,c,d"},
-        r"a\.csv:3: a quaternion's length is 1, got 1\.414",
-    ),
-    "far away": (
-        "x,y,yaw,field\n0,0,0,41000\n1e308,0,0,41000\n",
-        {},
-        r"a\.csv:3: x and y are metres, within",
-    ),
-    "vectors of another size": (
-        "x,y,yaw,field,bx,by,bz\n0,0,0,41000,12,20,-33\n1,0,0,41000,12,20,-33\n",
-        {"vector": "bx,by,bz", "field": "field"},
-        r"a\.csv: bx,by,bz is 0\.000986 times as long as field .median.; give both in one unit",
-    ),
-    "word": ("x,y,yaw,field\n0,0,0,high\n", {}, r"a\.csv:2: field must be a finite number, got 'high'"),
-}
-
-
-@pytest.mark.parametrize("case", REFUSALS)
-def test_a_table_that_makes_no_readings_is_refused(tmp_path, case):
-    text, options, what = REFUSALS[case]
-    if text is not None:
-        file(tmp_path, text)
-    with pytest.raises(InputError, match=what):
-        read_readings(tmp_path / "a.csv", columns=Columns(**options))
-
-
-@pytest.mark.parametrize(
-    ("options", "what"),
-    [
-        ({"vector": "bx,by"}, "vector takes 3 columns with commas between, got 'bx,by'"),
-        ({"quaternion": "q"}, "quaternion takes 4 columns"),
-        (
-            {"quaternion": "a,b,c,d", "heading": "yaw"},
-            "give either the heading's column or the quaternion's",
-        ),
-    ],
-)
-def test_columns_that_cannot_be_are_refused_at_birth(options, what):
-    with pytest.raises(InputError, match=what):
-        Columns(**options)
-
-
-def test_columns_are_refused_for_sources_whose_columns_are_known(tmp_path):
-    save_readings(read_readings(file(tmp_path, ROWS)), tmp_path / "a.parquet")
-    (tmp_path / "maps").mkdir()
-    for source in ("a.parquet", "maps"):
-        with pytest.raises(InputError, match="its columns are known; drop the options"):
-            read_readings(tmp_path / source, columns=Columns(x="px"))
+@pytest.mark.parametrize(("text", "options", "words"), REFUSALS, ids=range(len(REFUSALS)))
+def test_a_table_that_makes_no_readings_is_refused(tmp_path, text, options, words):
+    path = file(tmp_path, text)
+    with pytest.raises(InputError, match=words):
+        read_readings(path, columns=Columns(**options))
 
 
 def test_a_gridded_survey_is_not_one_of_several_sources(tmp_path, real_data):
@@ -609,21 +490,6 @@ def test_a_scale_takes_the_values_of_a_normalised_sensor_to_nt(tmp_path):
     assert_allclose(body, 45_000 * np.array([[0.3, 0.2, -0.8], [0.5, 0, -1]]))
 
 
-def test_a_scale_that_cannot_be_is_refused_with_one_that_could(tmp_path):
-    path = file(tmp_path, "x,y,yaw,b\n0,0,0,0.9\n1,0,1,1.1\n")
-    with pytest.raises(InputError, match=r"normalised sensor give --scale, the factor to nT \(50000 would"):
-        read_readings(path, columns=Columns(field="b"))
-    with pytest.raises(InputError, match=r"median of b is 3 nT with scale 3, .*; --scale 50000 would make"):
-        read_readings(path, columns=Columns(field="b", scale=3.0))
-    with pytest.raises(InputError, match="the unit of the field or its scale"):
-        Columns(scale=3.0, unit="uT")
-    with pytest.raises(InputError, match="scale, the factor to nT, must be above 0, got 0"):
-        Columns(scale=0.0)
-    save_readings(read_readings(file(tmp_path, ROWS, "b.csv")), tmp_path / "b.parquet")
-    with pytest.raises(InputError, match="in nT already; leave out --scale"):
-        read_readings(tmp_path / "b.parquet", columns=Columns(scale=2.0))
-
-
 def test_a_pattern_stands_for_the_files_that_match_it_in_the_order_of_their_names(tmp_path, monkeypatch):
     files = [file(tmp_path, ROWS.replace("0,0,0.5", f"{k},0,0.5"), f"drive_{k}.csv") for k in (2, 0, 1)]
     want = read_readings(*sorted(files))
@@ -633,11 +499,3 @@ def test_a_pattern_stands_for_the_files_that_match_it_in_the_order_of_their_name
     assert same(read_readings("drive_?.csv"), want)
     with pytest.raises(InputError, match=r"^no file or folder matches 'nowhere/\*\.csv'; check the pattern$"):
         read_readings("nowhere/*.csv")
-
-
-def test_a_folder_of_parquet_files_is_several_runs(tmp_path):
-    for name in ("b", "a"):
-        readings = read_readings(file(tmp_path, ROWS, f"{name}.csv"))
-        (tmp_path / "runs").mkdir(exist_ok=True)
-        save_readings(readings, tmp_path / "runs" / f"{name}.parquet")
-    assert read_readings(tmp_path / "runs").runs == ("a", "b")

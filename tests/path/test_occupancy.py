@@ -81,13 +81,6 @@ def test_map_server_reads_the_files(tmp_path: Path) -> None:
         OccupancyGrid(cells, 0.05, (0.0, 0.0)).save(tmp_path / "lab.yaml")
 
 
-def test_a_large_hall_gets_larger_cells_by_default() -> None:
-    wall = np.array([[-60.0, 40.0], [60.0, 40.0], [60.0, 40.1], [-60.0, 40.1]])
-    grid = occupancy_of(Room((120.0, 80.0), 0.17, Obstacles(("wall",), (wall,))))
-    assert grid.resolution_m == 0.1  # 2401 x 1601 cells of 0.05 m would be too many
-    assert (at(grid, np.column_stack([np.linspace(-59.9, 59.9, 500), np.full(500, 40.05)])) == OCCUPIED).all()
-
-
 def test_wrong_resolutions_and_suffixes_are_refused(tmp_path: Path) -> None:
     room = Room((6.0, 3.5), 0.17, Obstacles())
     for resolution, match in ((0.0, "above 0"), (np.nan, "above 0"), (1e-4, "too many")):

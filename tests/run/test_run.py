@@ -39,16 +39,6 @@ def assert_same(a, b):
         assert a[name].tobytes() == b[name].tobytes(), name
 
 
-def test_columns_come_back_by_name_and_a_misspelt_one_names_the_near():
-    run = Run({"t": [0, 1], "b_total_nt": [4e4, 4.1e4]})
-    assert run["b_total_nt"].dtype == float
-    assert run.rows == 2
-    assert run.duration_s == 1.0
-    with pytest.raises(UnknownNameError, match="no column 'b_totl_nt'; did you mean 'b_total_nt'"):
-        run["b_totl_nt"]
-    assert run.get("nothing") is None  # a Mapping's own behaviour, since the refusal is a KeyError
-
-
 def test_unequal_columns_and_wrong_shapes_are_refused():
     with pytest.raises(InputError, match=r"equally long, got {'t': 2, 'yaw': 3}"):
         Run({"t": [0, 1], "yaw": [0, 1, 2]})
@@ -175,13 +165,6 @@ def test_orientations_turn_as_scipys_slerp_does_whatever_their_signs():
     assert (read.inv() * peer).magnitude().max() < 1e-7
     near = Run({"t": [0, 1], "q_world_base_xyzw": [[0, 0, 0, 1], [0, 0, 1e-9, 1]]})
     assert_allclose(near.resample([0.5])["q_world_base_xyzw"], [[0, 0, 5e-10, 1]], atol=1e-18)
-
-
-def test_a_rate_gives_instants_from_the_start_none_after_the_end():
-    run = Run({"t": np.arange(28) / 135, "yaw": np.zeros(28)})
-    assert np.array_equal(run.resample(rate_hz=135)["t"], run["t"])
-    assert_allclose(run.resample(rate_hz=10)["t"], [0, 0.1, 0.2])
-    assert run.resample(rate_hz=10).metadata["derived"] == "resample(rate_hz=10)"
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from rooms import EARTH, SOURCES, scene_of, wavy_map
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
@@ -18,22 +19,11 @@ from magtwin.sim.exact import check_field, check_read
 from magtwin.sim.runs.simulate import simulate
 from magtwin.sim.session import draw_session
 from magtwin.spec.drive import DriveSpec
-from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
+from magtwin.spec.magnetics import PlatformFieldSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import MagnetometerSpec
 
-EARTH = EarthFieldSpec(
-    b_world_nt=(-2_600.0, 24_000.0, -38_000.0),
-    latitude_deg=29.6,
-    longitude_deg=-82.3,
-    height_m=30.0,
-    date="2026-01-01",
-)
-SOURCES = (
-    SourceSpec(name="chair", p_world=(0.5, 0.3, -0.5), m_world=(5.0, -3.0, 20.0)),
-    SourceSpec(name="desk", p_world=(-1.0, 0.8, -0.4), m_world=(-9.0, 4.0, -12.0)),
-)
 PLATFORM = PlatformFieldSpec(
     hard_iron_nt=(620.0, -430.0, 900.0),
     soft_iron=(0.008, 0.001, 0.0, 0.001, -0.004, 0.0, 0.0, 0.0, 0.002),
@@ -57,18 +47,10 @@ ROBOT = RobotSpec(
     magnetometer=SENSOR,
     drive=DriveSpec(localization_std_m=0.0, localization_yaw_std=0.0, localization_latency_s=0.0),
 )
-SURVEYED = Scene(name="surveyed", map_layer=Path("map.usdc"), robot=ROBOT)
+SURVEYED = scene_of(ROBOT, "surveyed")
 KNOWN = replace(SURVEYED, name="known", earth=EARTH, sources=SOURCES)
 BARE = replace(SURVEYED, robot=replace(ROBOT, platform=PlatformFieldSpec()))
-SIZE = {"origin_m": (-3.0, -1.75), "cell_m": (6 / 24, 3.5 / 14)}
-
-
-def wavy(headings: int = 4) -> AnomalyMap:
-    values = 41_000 + 1_000 * np.random.default_rng(5).standard_normal((headings, 15, 25))
-    return AnomalyMap(values_nt=values, headings_rad=2 * np.pi * np.arange(headings) / headings, **SIZE)
-
-
-MAP, ONE = wavy(), wavy(1)
+MAP, ONE = wavy_map(), wavy_map(1)
 FLAT = replace(MAP, values_nt=np.full((4, 15, 25), 41_000.0))
 
 

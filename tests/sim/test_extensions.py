@@ -1,4 +1,4 @@
-"""Custom sensors, interference, controllers and engines, as a user registers them."""
+"""Custom sensors and interference, as a user registers them."""
 
 from types import MappingProxyType
 
@@ -9,8 +9,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from magtwin.path import path_named
 from magtwin.run.run import Column
 from magtwin.sim import extensions
-from magtwin.sim.motion.drive import Motion
-from magtwin.sim.motion.engine import ENGINES, KINEMATIC
 from magtwin.sim.runs.simulate import simulate
 
 
@@ -29,16 +27,6 @@ class Speedometer:
 def pump_nt(columns, robot, rng):
     hum = 300.0 * np.sin(2 * np.pi * 0.8 * columns["t"])
     return np.column_stack([0 * hum, 0 * hum, hum])
-
-
-@extensions.controller("test_straight_on")
-class StraightOn:
-    def __init__(self, path, drive, speed):
-        self.speed, self.done = speed, False
-
-    def command(self, t, x, y, yaw, v, w):
-        self.done = t > 2.0
-        return (0.0 if self.done else self.speed), 0.0
 
 
 def run_of(twin, **options):
@@ -63,26 +51,3 @@ def test_an_interference_term_is_added_to_the_field_at_the_sensor(twin):
     )
     assert_allclose(run["b_truth_nt"], np.linalg.norm(run["b_vector_nt"], axis=1))
     assert_allclose(run["b_total_nt"], run["b_truth_nt"])
-
-
-def test_a_registered_controller_drives_by_its_name(twin):
-    run = run_of(twin, controller="test_straight_on")
-    assert run.metadata["controller"] == "test_straight_on"
-    moved = run["p_world_base"][-1] - run["p_world_base"][0]
-    assert np.hypot(*moved[:2]) == pytest.approx(0.4, abs=0.05)
-    assert np.ptp(run["yaw"]) < 0.05
-
-
-def test_a_registered_engine_moves_the_robot(twin):
-    class Frozen:
-        name = "frozen"
-
-        def drive(self, closed_loop, controller, obstacles):
-            still = np.zeros(closed_loop.steps)
-            return Motion(closed_loop.drive, closed_loop.dt, still, still, closed_loop.pose0)
-
-    extensions.engine("test_frozen")(Frozen())
-    run = run_of(twin, engine=ENGINES["test_frozen"])
-    assert run.metadata["engine"] == "frozen"
-    assert np.ptp(run["p_world_base"], axis=0).max() == 0
-    assert ENGINES["kinematic"] is KINEMATIC

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from rooms import EARTH, scene_of
 
 from magtwin.field.sources.dipoles import dipole_field_nt
 from magtwin.sim.interference import (
@@ -21,19 +22,11 @@ from magtwin.sim.interference import (
 from magtwin.sim.motion.drive import Motion
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.furniture import FurnitureSpec
-from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
+from magtwin.spec.magnetics import PlatformFieldSpec, SourceSpec
 from magtwin.spec.robot import RobotSpec
-from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import BatterySpec
 
-EARTH = EarthFieldSpec(
-    b_world_nt=(-2_745.6, 24_067.1, -38_418.4),
-    latitude_deg=29.65,
-    longitude_deg=-82.35,
-    height_m=50.0,
-    date="2026-11-21",
-)
-SCENE = Scene(name="hall", map_layer=Path("hall.usdc"), robot=RobotSpec(name="r", asset=Path("r.usda")))
+SCENE = scene_of(RobotSpec(name="r", asset=Path("r.usda")))
 QUIET = {
     "b_rate": np.zeros((4, 3)),
     "motor_nm": np.zeros((4, 2)),
@@ -112,18 +105,6 @@ def test_each_part_of_the_robots_field_enters_by_its_own_law():
         state |= changed
         total = total + added
     assert_allclose(platform_field_nt(everything, B, **state), total, rtol=1e-12)
-
-
-def test_hard_iron_makes_one_wave_a_turn_of_the_expected_amplitude():
-    platform = PlatformFieldSpec(hard_iron_nt=(300.0, 400.0, 0.0))
-    yaw = np.linspace(0, 2 * np.pi, 360, endpoint=False)
-    b = np.column_stack([24_000 * np.cos(yaw), -24_000 * np.sin(yaw), np.full(360, -38_000.0)])
-    still = {k: np.zeros((360, *v.shape[1:])) for k, v in QUIET.items()}
-    size = np.linalg.norm(platform_field_nt(platform, b, **still), axis=1)
-    wave = np.abs(np.fft.rfft(size)) / 180
-    # |b + h| = |b| + h . b / |b| + O(h^2 / |b|); the last is 500^2 / 45,000 = 6 nT
-    assert wave[1] == pytest.approx(500 * 24_000 / np.hypot(24_000, 38_000), abs=6)
-    assert np.all(wave[2:] < 6)
 
 
 ROLLING = RobotSpec(

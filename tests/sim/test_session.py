@@ -5,15 +5,14 @@ from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
+from rooms import EARTH, scene_of
 
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.features import FULL, features
 from magtwin.path import PATHS, path_named
 from magtwin.sim.runs.simulate import simulate
 from magtwin.sim.session import draw_session, draw_speed
-from magtwin.spec.magnetics import EarthFieldSpec
 from magtwin.spec.robot import RobotSpec
-from magtwin.spec.scene import Scene
 
 REAL = {
     "yaw_deg": (180.295, 101.551),
@@ -45,18 +44,7 @@ LONGEST_S = 90.0
 """No run is longer, so that no path stands for all."""
 
 ROBOT = RobotSpec(name="robot", asset=FilePath("robot.usda"))
-SCENE = Scene(
-    name="plain",
-    map_layer=FilePath("map.usdc"),
-    robot=ROBOT,
-    earth=EarthFieldSpec(
-        b_world_nt=(-2_600.0, 24_000.0, -38_000.0),
-        latitude_deg=29.6,
-        longitude_deg=-82.3,
-        height_m=30.0,
-        date="2026-01-01",
-    ),
-)
+SCENE = scene_of(ROBOT, earth=EARTH)
 MAP = AnomalyMap(
     values_nt=np.full((4, 2, 2), 41_000.0),
     origin_m=(-3.0, -1.75),

@@ -33,12 +33,6 @@ def test_the_limiter_keeps_the_curvature(v_wanted, w_wanted, v, w):
     assert abs(limited_w) <= abs(same_w)
 
 
-def test_a_command_to_turn_on_the_spot_does_not_move_a_car():
-    motion = play([[0.0, 0.0, 1.0], [0.5, 0.0, 1.0]], CAR)
-    assert not motion.v.any()
-    assert not motion.w.any()
-
-
 def test_a_hard_turn_at_speed_is_a_circle_of_the_turning_radius():
     commands = [[t, 0.3, 5.0] for t in np.arange(0, 4, 0.25)]
     motion = play(commands, CAR)

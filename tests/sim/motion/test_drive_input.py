@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from magtwin.errors import InputError
-from magtwin.path import Path, path_named
 from magtwin.run.run import Run
-from magtwin.sim.motion.drive_input import drive_input, drive_inputs
 from magtwin.twin import open_twin, simulate, simulate_robots, sweep
 from magtwin.usd.scene import read_scene
 
@@ -71,19 +69,6 @@ def test_points_give_the_run_of_their_csv(twin, tmp_path):
     assert same(mixed[1], read)
     name = twin.scene.robot.name
     assert same(simulate_robots(twin, {name: POINTS}, **SHORT)[name], read)
-
-
-def test_ways_are_one_for_all_or_one_each(tmp_path):
-    file = csv_of(POINTS, tmp_path / "a.csv")
-    assert isinstance(drive_inputs(POINTS), Path)
-    assert isinstance(drive_inputs(np.array(POINTS)), Path)
-    assert drive_inputs("random") == "random"
-    a, b, c = drive_inputs([file, "random", file])
-    assert (a is c, b) == (True, "random")
-    drawn = drive_inputs(np.stack([POINTS, POINTS]))
-    assert [path.name for path in drawn] == ["points", "points"]
-    path = path_named("sine")
-    assert (drive_input(path), drive_inputs(iter([path]))) == (path, [path])
 
 
 @pytest.mark.parametrize(

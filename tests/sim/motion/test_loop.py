@@ -13,7 +13,7 @@ from magtwin.errors import InputError
 from magtwin.path import Path, path_named
 from magtwin.sim.motion import closed_loop as courses
 from magtwin.sim.motion.closed_loop import Chassis, ClosedLoop, run_loops
-from magtwin.sim.motion.controllers import CONTROLLERS, guide_by_commands
+from magtwin.sim.motion.controllers import CONTROLLERS
 from magtwin.sim.motion.drive import Motion, draw_wheel_errors
 from magtwin.sim.motion.follow import follow, loop_along, play
 from magtwin.spec.drive import DriveSpec
@@ -158,18 +158,6 @@ def test_a_robot_drives_to_the_same_bits_alone_in_blocks_and_among_others(both, 
             assert_same(first, other[n])
 
 
-def test_the_loop_opens_its_machine_code_when_that_has_paid(monkeypatch):
-    monkeypatch.setattr(courses.LOOPS, "code", None)
-    monkeypatch.setattr(courses.LOOPS, "done", 0)
-    steps = 20 * 4500  # numba is open here, so a twentieth pays
-    monkeypatch.setattr(courses.LOOPS, "pays", steps)
-    first = follow(path_named("figure8"), REAL, speed=0.2, duration_s=60.0)
-    assert courses.LOOPS.code is None
-    second = follow(path_named("figure8"), REAL, speed=0.2, duration_s=60.0)
-    assert courses.LOOPS.code is not None
-    assert_same(first, second)
-
-
 # --- the drive --------------------------------------------------------------------------------------------
 
 
@@ -212,20 +200,6 @@ def test_scrubbing_and_wheels_of_another_size_scale_the_twist(way):
     assert_allclose(motion.v, 0.2 * 1.01, rtol=1e-14)
     assert_allclose(motion.w, 1.0 * 1.01 / 0.98 * 0.95, rtol=1e-14)
     assert_allclose(motion.wheel_rates[10], [(0.2 - 0.1165) / 0.03575, (0.2 + 0.1165) / 0.03575], rtol=1e-12)
-
-
-@settings(max_examples=30, deadline=None)
-@given(seed=st.integers(0, 10_000), lag=st.sampled_from([0.0, 0.05, 0.4]))
-def test_no_limit_is_exceeded_whatever_is_commanded(seed, lag):
-    drive = dataclasses.replace(IDEAL, motor_lag_s=lag)
-    rng = np.random.default_rng(seed)
-    t = np.sort(rng.uniform(0, 8, 40))
-    motion = play(np.column_stack([t, rng.normal(0, 1, 40), rng.normal(0, 6, 40)]), drive)
-    slack = 1 + 1e-9
-    for x, top, rate in ((motion.v, drive.v_max, drive.a_max), (motion.w, drive.w_max, drive.alpha_max)):
-        assert np.abs(x).max() <= top * slack
-        assert np.abs(np.diff(x, prepend=0.0)).max() <= rate * motion.dt * slack
-    assert np.abs(motion.wheel_rates).max() <= drive.wheel_rate_max * slack
 
 
 # --- contact ----------------------------------------------------------------------------------------------
@@ -299,13 +273,6 @@ class Straight:
 LINE = Path("line", np.array([[0.0, 0.0], [2.0, 0.0]]))
 
 
-def test_a_controller_of_ones_own_drives_until_it_is_done_and_the_robot_stands():
-    motion = follow(LINE, REAL, speed=0.2, controller=Straight())
-    assert motion.poses[-1, 0] == pytest.approx(1.0, abs=0.05)
-    assert motion.v[-1] == pytest.approx(0.0, abs=2e-3)
-    assert len(motion.v) < 400
-
-
 def test_a_controller_that_falls_silent_is_obeyed_until_the_drive_loses_patience():
     spoken = follow(LINE, PROMPT, speed=0.2, controller=Straight(every=20), duration_s=3.0)
     assert_allclose(spoken.v, 0.2)
@@ -321,24 +288,6 @@ def test_a_guide_asked_step_by_step_drives_as_the_loop_does():
     while not guide.done and chassis.t < 40.0 - 1e-9:
         rows.append(chassis.step(guide.command(chassis.t, *chassis.pose, *chassis.twist)))
     assert_same(courses.motion_of(course, np.array(rows).T), run_loops([course])[0])
-
-
-def test_a_chassis_tells_where_it_is_and_what_it_touches():
-    course = ClosedLoop(
-        drive=PROMPT,
-        guide=guide_by_commands([[0.0, 0.0, 0.0]], PROMPT),
-        dt=0.02,
-        pose0=(0.0, 0.0, 0.0),
-        steps=1,
-        footprint_radius_m=RADIUS,
-    )
-    chassis = Chassis(course, wall(0.3))
-    for _ in range(50):
-        chassis.step((0.2, 0.0))
-    assert chassis.bump
-    assert chassis.t == pytest.approx(1.0)
-    assert_allclose(chassis.pose, [0.3 - RADIUS, 0.0, 0.0], atol=1e-9)
-    assert chassis.twist == (0.0, 0.0)
 
 
 # --- refusals ---------------------------------------------------------------------------------------------
@@ -364,8 +313,3 @@ def test_a_start_in_a_wall_is_refused_with_its_place():
     says = r"begin in wall: at \(0\.000, 0\.000\) m its footprint of radius 0\.171 m is 0\.071 m too near"
     with pytest.raises(InputError, match=says):
         play(held(0.1, 0.0, 1.0), REAL, obstacles=wall(0.1), footprint_radius_m=RADIUS)
-
-
-def test_an_unknown_controller_is_refused_with_the_nearest_one():
-    with pytest.raises(InputError, match=r"no controller 'folower'; did you mean 'follower'\?"):
-        follow(LINE, REAL, speed=0.2, controller="folower")

@@ -1,7 +1,6 @@
 """sweep: the bits of simulate, whatever the block and the order; sessions; refusals."""
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
@@ -10,9 +9,7 @@ from test_network import a_net
 from magtwin import simulate, sweep
 from magtwin.errors import InputError
 from magtwin.run.run import COLUMNS, Run
-from magtwin.sim.motion import closed_loop
 from magtwin.sim.motion.commands import Commands
-from magtwin.sim.runs import batch
 from magtwin.twin import Twin, open_twin
 
 PATHS = ("figure8", "sine", "continuous_cycle", "figure8", "sine", "figure8", "curvilinear")
@@ -97,12 +94,6 @@ def test_whole_paths_end_when_each_robot_stands(physical, tmp_path):
     assert runs[0].duration_s < runs[1].duration_s
 
 
-def test_the_compiled_loop_gives_the_bits_of_plain_python(neural, alone, monkeypatch):
-    monkeypatch.setattr(closed_loop.LOOPS, "pays", 0)  # opens it
-    for run, own in zip(sweep(neural, PATHS, SEEDS, speeds=SPEEDS, **SHORT), alone, strict=True):
-        assert_same(run, own)
-
-
 @pytest.mark.parametrize(
     "wanted",
     [
@@ -121,16 +112,6 @@ def test_columns_that_are_kept_are_those_named_and_t_in_the_tables_order(neural,
         assert list(run) == [name for name in COLUMNS if name in {"t", *wanted}]
         for name in run:
             assert run[name].tobytes() == own[name].tobytes()
-
-
-def test_no_more_than_two_blocks_are_made_ahead(neural, monkeypatch):
-    made = []
-    sense = batch.sense_all
-    monkeypatch.setattr(batch, "sense_all", lambda *a, **k: made.append(1) or sense(*a, **k))
-    runs = iter(sweep(neural, "figure8", range(50), block=2, **SHORT))
-    list(itertools.islice(runs, 1))
-    assert len(made) <= 4
-    runs.close()
 
 
 @pytest.mark.parametrize(

@@ -138,10 +138,3 @@ def test_a_reward_of_ones_own_is_asked_for_each_step(twin):
 def test_bad_options_are_refused(twin, options, text):
     with pytest.raises(InputError, match=text):
         magtwin.gym.MagNavEnv(**{"scene": twin, **options})
-
-
-def test_a_reward_of_the_wrong_shape_is_refused(twin):
-    env = magtwin.gym.MagNavVectorEnv(2, scene=twin, reward=lambda step: np.zeros(3))
-    env.reset(seed=0)
-    with pytest.raises(InputError, match="reward must give shape"):
-        env.step(np.zeros((2, 2)))

@@ -10,12 +10,9 @@ import pytest
 
 import magtwin as mt
 from magtwin.errors import InputError
-from magtwin.io import tables
 from magtwin.io.formats import read_run, write_run
 from magtwin.io.outputs import Outputs
-from magtwin.io.tables import parquet_of
 from magtwin.run import mapped
-from magtwin.run.run import Column
 from magtwin.run.spool import Spool, blocks
 
 ROWS = 2160
@@ -115,20 +112,6 @@ def test_a_run_that_is_killed_while_it_is_written_is_whole_in_its_parts(
     assert in_child(work) == -signal.SIGKILL
     assert not file.exists()
     assert content(read_run(f"{file}.parts")) == content(run)
-
-
-def test_parquet_of_a_long_run_is_read_in_blocks(run, tmp_path, monkeypatch, long_runs):
-    spec = Column("K", "", "temperature of the head")
-    run = run.with_columns(head_k=np.arange(ROWS)).with_specs(head_k=spec)
-    write_run(run, tmp_path / "a.parquet")
-    assert parquet_of(run) == (tmp_path / "a.parquet").read_bytes()
-    seen, whole = [], tables.run_of
-    monkeypatch.setattr(tables, "run_of", lambda table, *rest: seen.append(len(table)) or whole(table, *rest))
-    again = read_run(tmp_path / "a.parquet")
-    assert content(again) == content(run)
-    assert again.spec("head_k") == spec
-    assert max(seen) <= 384
-    assert sum(seen) == ROWS
 
 
 def resident_mb():

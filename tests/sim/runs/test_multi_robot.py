@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from rooms import EARTH, scene_of
 
 from magtwin.author.scene import author_scene
 from magtwin.cli import main
@@ -22,25 +23,18 @@ from magtwin.sim.motion.drive import Motion
 from magtwin.sim.runs.multi_robot import simulate_robots as run_robots
 from magtwin.sim.runs.neighbours import Neighbour, iron_moments, neighbours_field_nt
 from magtwin.spec.drive import DriveSpec
-from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec
+from magtwin.spec.magnetics import PlatformFieldSpec
 from magtwin.spec.robot import PlacedRobot, RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.twin import Twin, scene_from_toml, simulate_robots
 from magtwin.twin import simulate as simulate_one
 
-EARTH_NT = np.array([-2700.0, 24000.0, -38400.0])
+EARTH_NT = np.array(EARTH.b_world_nt)
 FLAT = AnomalyMap(
     values_nt=np.full((1, 2, 2), np.linalg.norm(EARTH_NT)),
     origin_m=(-3, -2),
     cell_m=(6, 4),
     headings_rad=np.zeros(1),
-)
-EARTH = EarthFieldSpec(
-    b_world_nt=tuple(EARTH_NT.tolist()),
-    latitude_deg=29.65,
-    longitude_deg=-82.35,
-    height_m=50,
-    date="2026-01-01",
 )
 IRON = PlatformFieldSpec(
     hard_iron_nt=(415.0, 760.0, 2000.0),
@@ -68,18 +62,9 @@ def line(name: str, *points: tuple[float, float]) -> Path:
     return Path(name, np.array(points))
 
 
-SCENE = Scene(
-    name="two",
-    map_layer="flat.usdc",
-    robot=robot("ann"),
-    earth=EARTH,
-    others=(PlacedRobot(robot=robot("bob")), PlacedRobot(robot=robot("cleo"))),
-)
-EAST, WEST, NORTH = (
-    line("east", (-2, 0), (2, 0)),
-    line("west", (2, 0.6), (-2, 0.6)),
-    line("far", (-2.5, -1.5), (-2, -1.5)),
-)
+OTHERS = (PlacedRobot(robot=robot("bob")), PlacedRobot(robot=robot("cleo")))
+SCENE = scene_of(robot("ann"), earth=EARTH, others=OTHERS)
+EAST, WEST = line("east", (-2, 0), (2, 0)), line("west", (2, 0.6), (-2, 0.6))
 FAR = line("far", (-2.5, -1.5), (-2.4, -1.5))
 
 

@@ -6,29 +6,21 @@ from pathlib import Path as FilePath
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from rooms import EARTH, SOURCES, scene_of, wavy_map
 
 from magtwin.errors import InputError
-from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import rotate, yaw_from_quat
 from magtwin.path import Path, path_named
 from magtwin.run.run import COLUMNS, Run
 from magtwin.sim.interference import ambient_gradient_nt_m
 from magtwin.sim.runs.simulate import simulate
 from magtwin.spec.drive import DriveSpec
-from magtwin.spec.lab import LabSpec
-from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec, SourceSpec
+from magtwin.spec.magnetics import PlatformFieldSpec, SourceSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import ImuSpec, MagnetometerSpec
 
-EARTH_NT = np.array([-2_600.0, 24_000.0, -38_000.0])
-EARTH = EarthFieldSpec(
-    b_world_nt=tuple(EARTH_NT.tolist()),
-    latitude_deg=29.6,
-    longitude_deg=-82.3,
-    height_m=30.0,
-    date="2026-01-01",
-)
+EARTH_NT = np.array(EARTH.b_world_nt)
 ROBOT = RobotSpec(
     name="robot",
     asset=FilePath("robot.usda"),
@@ -36,23 +28,9 @@ ROBOT = RobotSpec(
     platform=PlatformFieldSpec(hard_iron_nt=(620.0, -430.0, 250.0), lidar_nt=(160.0, -90.0, 130.0)),
     drive=DriveSpec(localization_std_m=0.0, localization_yaw_std=0.0, localization_latency_s=0.0),
 )
-SOURCES = (
-    SourceSpec(name="chair", p_world=(0.5, 0.3, -0.5), m_world=(5.0, -3.0, 20.0)),
-    SourceSpec(name="desk", p_world=(-1.0, 0.8, -0.4), m_world=(-9.0, 4.0, -12.0)),
-)
-SURVEYED = Scene(name="surveyed", map_layer=FilePath("map.usdc"), robot=ROBOT)
-KNOWN = Scene(name="known", map_layer=FilePath("map.usdc"), robot=ROBOT, earth=EARTH, sources=SOURCES)
+SURVEYED = scene_of(ROBOT, "surveyed")
+KNOWN = scene_of(ROBOT, "known", earth=EARTH, sources=SOURCES)
 LINE = Path("line", np.array([[-0.5, 0.2], [0.5, 0.2]]))
-
-
-def wavy_map(extent_m: tuple[float, float] = (6.0, 3.5)) -> AnomalyMap:
-    values = 41_000 + 1_000 * np.random.default_rng(5).standard_normal((4, 15, 25))
-    return AnomalyMap(
-        values_nt=values,
-        origin_m=(-extent_m[0] / 2, -extent_m[1] / 2),
-        cell_m=(extent_m[0] / 24, extent_m[1] / 14),
-        headings_rad=np.arange(4) * np.pi / 2,
-    )
 
 
 MAP = wavy_map()
@@ -78,25 +56,6 @@ def test_a_run_has_every_column_in_order_and_no_other():
         if name != "b_sd_nt":
             assert np.all(np.isfinite(values)), name
     assert np.isnan(run["b_sd_nt"]).all()
-
-
-def test_metadata_tell_how_the_run_came_about():
-    run = drive(speed=0.3, duration_s=2.0, lidar="on")
-    assert dict(run.metadata) == {
-        "scene": "known",
-        "path": "line",
-        "controller": "follower",
-        "speed_m_s": 0.3,
-        "robot_name": "robot",
-        "sensor_m": "0.05, 0, 0.36",
-        "mocap_offset_m": "0, 0",
-        "mocap_latency_s": 0.015167,  # 10 ms, a mean jitter of 1 ms, half a period at 120 Hz
-        "rate_hz": 135.0,
-        "duration_s": 2.0,
-        "outside": "nan",
-        "lidar": "on",
-        "magnetometer": "physical",
-    }
 
 
 def test_columns_of_the_truth_agree_with_each_other():
@@ -225,19 +184,6 @@ def test_every_error_has_an_address():
         assert_allclose(off, [50, 0, 0], atol=25)
 
 
-def test_a_physical_magnetometer_reads_the_exact_field_and_one_of_the_map_alone_the_map():
-    exact, known = drive(), with_robot(KNOWN, magnetometer=MagnetometerSpec(kind="map-only"))
-    alone, surveyed = drive(known), drive(with_robot(SURVEYED, magnetometer=known.robot.magnetometer))
-    assert exact.metadata["magnetometer"] == "physical"
-    assert_array_equal(exact["b_total_nt"], exact["b_map_nt"] + (exact["b_truth_nt"] - exact["b_map_nt"]))
-    for run in (alone, surveyed):  # the map is there whether or not the exact field is known
-        assert run.metadata["magnetometer"] == "map-only"
-        assert_array_equal(run["b_total_nt"], run["b_map_nt"])
-        assert_array_equal(run["b_disturbance_nt"], 0)
-    assert_array_equal(alone["b_truth_nt"], exact["b_truth_nt"])
-    assert np.isnan(surveyed["b_truth_nt"]).all()
-
-
 STEEP = SourceSpec(name="beam", p_world=(0.0, 0.35, 0.36), m_world=(0.0, 0.0, 3.0))
 """Beside the middle of LINE, at the magnetometer's height and 15 cm from where it comes by."""
 
@@ -267,17 +213,6 @@ def test_lock_is_lost_beside_steel_and_found_again_farther_on():
     )
 
 
-def test_a_wall_that_a_corner_swings_over_is_a_bump():
-    # A fold at the very edge: turning on the spot after stopping leaves the robot a fraction of a
-    # millimetre over, which a floor that ends there feels.
-    edge = Path("edge", np.array([[-0.5, 0.2], [0.5, 0.2], [0.5, -0.2]]))
-    tight = dataclasses.replace(KNOWN, lab=LabSpec(floor_m=(2 * (0.5 + 0.171), 3.5)))
-    run = drive(tight, edge)
-    reach = np.abs(run["p_world_base"][:, 0]) + 0.171
-    assert_array_equal(run["flag_bump"], reach > 0.671 + 1e-9)
-    assert run["flag_bump"].any()
-
-
 def test_one_seed_gives_identical_arrays_and_another_gives_others():
     a, b, c = drive(seed=3), drive(seed=3), drive(seed=4)
     for name in COLUMNS:
@@ -295,7 +230,7 @@ def test_one_seed_gives_identical_arrays_and_another_gives_others():
         ({"duration_s": -1.0}, "duration_s must be above 0 s"),
         ({"duration_s": float("inf")}, "duration_s must be above 0 s and finite, got inf"),
         ({"duration_s": 3600.0, "rate_hz": 1e4}, "more than 20,000,000; lower `rate_hz` to 5556 Hz"),
-        ({"anomaly_map": wavy_map((0.5, 3.5)), "outside": "raise"}, "off the map"),
+        ({"anomaly_map": wavy_map(extent_m=(0.5, 3.5)), "outside": "raise"}, "off the map"),
         ({"lidar": "maybe"}, 'lidar must be "schedule", "on" or "off"'),
         ({"outside": "guess"}, 'outside must be "nan", "clamp" or "raise"'),
         ({"scene": SURVEYED, "anomaly_map": FLAT}, "'surveyed' has a constant map and no Earth field"),

@@ -44,16 +44,6 @@ def test_the_variance_is_that_of_the_prediction_whatever_that_is():
     assert_allclose(errors.mean(axis=0), 0, atol=0.03 * sd.max())
 
 
-@pytest.mark.parametrize("rate_hz", [5.0, 20.0, 135.0])
-def test_the_process_forgets_in_its_time_at_any_rate(rate_hz):
-    process = (
-        ModelError(OFFSET, TIME_S).process(np.random.default_rng(1), rate_hz).next(round(2000 * rate_hz))
-    )
-    assert process.std() == pytest.approx(1.0, abs=0.06)  # 500 times of independence
-    lag = round(TIME_S * rate_hz)
-    assert np.mean(process[lag:] * process[:-lag]) == pytest.approx(np.exp(-1), abs=0.1)
-
-
 def test_readings_lie_in_their_intervals_on_many_sessions(twin):
     runs = sweep(twin, "figure8", range(150), columns=["b_total_nt", "b_measured_nt", "b_sd_nt"], **SHORT)
     off = np.array([(run["b_measured_nt"] - run["b_total_nt"]) / run["b_sd_nt"] for run in runs])
@@ -97,25 +87,3 @@ def test_a_session_has_one_offset_and_another_session_another(lab_scene, tmp_pat
     assert a == again == many_a
     assert b == other == many_b
     assert abs(a - b) > 1e-3 * SD
-
-
-def test_a_vector_of_robots_has_an_error_and_draws_the_rest_as_without(twin):
-    gym = pytest.importorskip("magtwin.gym", reason="needs the extra gym")
-    seen = {}
-    for model_error in (True, False):
-        env = gym.MagNavVectorEnv(
-            200, scene=twin, signals=["b_measured_nt", "b_total_nt"], model_error=model_error
-        )
-        env.reset(seed=1)
-        rows = []
-        for _ in range(3):
-            env.step(np.tile([0.2, 0.0], (200, 1)))
-            rows.append({name: values.copy() for name, values in env.stepped.columns.items()})
-        seen[model_error] = rows
-    for a, b in zip(seen[True], seen[False], strict=True):
-        assert_array_equal(a["b_total_nt"], b["b_total_nt"])
-        assert_array_equal(a["imu_w"], b["imu_w"])
-        assert_array_equal(b["b_model_error_nt"], 0)
-        assert a["b_model_error_nt"].std() == pytest.approx(SD, rel=0.15)
-    first, last = seen[True][0]["b_model_error_nt"], seen[True][-1]["b_model_error_nt"]
-    assert np.corrcoef(first, last)[0, 1] > 0.85  # 0.2 s of 2 s, and the offset

@@ -20,18 +20,6 @@ def test_a_gauss_markov_process_is_a_plain_loop(time_s, count, seed):
     assert_allclose([*series, last], x, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "process", [lambda w, s: gauss_markov(w, s, 3.0, 10.0), lambda w, s: random_walk(w, s, 10.0)]
-)
-def test_pieces_give_the_bytes_of_the_whole(process):
-    white, last = np.random.default_rng(0).standard_normal((5000, 3)), np.zeros(3)
-    pieces = []
-    for part in np.split(white, [1, 2, 2, 777, 4096]):
-        series, last = process(part, last)
-        pieces.append(series)
-    assert np.concatenate(pieces).tobytes() == process(white, np.zeros(3))[0].tobytes()
-
-
 def test_a_gauss_markov_process_has_unit_spread_and_forgets_exponentially():
     rng = np.random.default_rng(0)
     y, _ = gauss_markov(rng.standard_normal((3000, 400)), rng.standard_normal(400), 2.0, 50.0)
