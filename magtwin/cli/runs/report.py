@@ -79,7 +79,8 @@ def compare(
     check_output(out, (".png", ".svg"), "a comparison", force=force)
     step("Comparing the runs")
     comparison = compare_files(a, b, align=align, out=out, force=force)
-    return Done(comparison, out or (), table=lambda: _print(comparison, names_of(a, b)))
+    names = names_of(a, b)
+    return Done(wrote=out or (), table=lambda: _print(comparison, names), data=comparison.summary())
 
 
 @app.command
