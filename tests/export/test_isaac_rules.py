@@ -101,17 +101,6 @@ def test_isaac_sims_rules_find_each_fault_of_a_robot_with_many(isaac_rules, robo
     }
 
 
-def test_a_robots_findings_name_its_prim_on_the_stage_and_come_once(isaac_rules, robot):
-    stage = robot.with_name("stage.usda")
-    stage.write_text('#usda 1.0\n(defaultPrim = "World")\ndef "World" {\n'
-                     'def "ann" (references = @./bot.usda@) {}\n}\n')  # fmt: skip
-    check = isaac(stage, {"/World/ann": robot})
-    rules = [(rule, where) for rule, where, _ in errors(check)]
-    assert rules.count(("RigidBodyHasCollider", "/World/ann/b")) == 1
-    assert ("RobotNaming", "/World/ann") in rules
-    assert {where.startswith("/World/ann") for _, where in rules} == {True}
-
-
 def test_rules_that_cannot_run_are_named_with_the_reason_and_are_not_counted(isaac_rules, lab_scene):
     asset = lab_scene.parent / "robots" / "turtlebot4" / "turtlebot4.usda"
     check = isaac(lab_scene, {"/World/turtlebot4": asset})

@@ -8,7 +8,6 @@ from made import joint, link
 from magtwin.errors import InputError
 from magtwin.files import budget
 from magtwin.files.budget import Budget
-from magtwin.urdf import repairs
 from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.description.description import read_description
 from magtwin.urdf.meshes.mesh import read_mesh
@@ -49,16 +48,6 @@ def test_colliders_in_one_place_are_compared_up_to_a_count(tmp_path, monkeypatch
     monkeypatch.setattr(articulation, "COMPARED", 14)
     with pytest.raises(InputError, match="link 'l4': over 14 pairs of colliders are in one place"):
         convert_urdf(robot(tmp_path, *links, *joints), tmp_path / "r.usda", force=True)
-
-
-def test_near_names_are_looked_for_a_limited_number_of_times(tmp_path, monkeypatch):
-    monkeypatch.setattr(repairs, "SUGGESTED", 1)
-    links = [link(f"l{i}", "") for i in range(3)]
-    follow = '<mimic joint="j"/>'
-    joints = [joint(f"j{i}", "l0", f"l{i + 1}", "continuous", follow) for i in range(2)]
-    texts = [entry.text for entry in read_description(robot(tmp_path, *links, *joints)).repairs.entries]
-    assert "no joint 'j' (did you mean 'j1'?)" in texts[0] or "no joint 'j' (did you mean 'j0'?)" in texts[0]
-    assert "no joint 'j': the mimic is left out" in texts[1]
 
 
 # --- xacro ----------------------------------------------------------------------------------------

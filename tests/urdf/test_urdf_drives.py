@@ -84,12 +84,6 @@ def test_joints_without_limits_hold_a_position_where_they_bear_a_load(tmp_path):
     assert drive_of(robot, "yaw")[1] >= 100  # that of an arm, such as Jaco's
 
 
-def test_a_wheel_by_name_rolls_although_its_centre_of_mass_is_beside_its_axis(tmp_path):
-    path = urdf(tmp_path, LEG.replace('"shank"', '"left_wheel"'), "leg")
-    _stage, robot, _ = converted(path)
-    assert drive_of(robot, "knee")[1] == 0
-
-
 @pytest.mark.parametrize(
     ("interfaces", "held"),
     [(("velocity", "position"), True), (("effort",), True), (("velocity",), False)],

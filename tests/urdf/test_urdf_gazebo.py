@@ -74,26 +74,6 @@ def test_friction_bounce_and_compliance_reach_the_collider(tmp_path):
     assert_valid(tmp_path / "cart.usda", tmp_path)
 
 
-@pytest.mark.parametrize(
-    "tags", ["<mu1>0.7</mu1><selfCollide>true</selfCollide>", '<mu1 value="0.7"/><selfCollide value="1"/>']
-)
-def test_a_figure_may_be_in_the_attribute_value_and_one_link_that_collides_with_its_robot_switches_all(
-    tmp_path, tags
-):
-    _, robot, report = cart(tmp_path, on("left_wheel", tags))
-    collider = robot.GetPrimAtPath("left_wheel/collisions").GetChildren()[0]
-    grip = UsdShade.MaterialBindingAPI(collider).ComputeBoundMaterial("physics")[0].GetPrim()
-    assert_allclose(grip.GetAttribute("physics:staticFriction").Get(), 0.7, rtol=1e-6)
-    for name in ("newton:selfCollisionEnabled", "physxArticulation:enabledSelfCollisions"):
-        assert robot.GetPrimAtPath("base_link").GetAttribute(name).Get() is True
-    assert not report.unknown_tags
-
-
-def test_friction_that_differs_across_is_a_loss(tmp_path):
-    _, _, report = cart(tmp_path, on("left_wheel", "<mu1>1</mu1><mu2>0.2</mu2>"))
-    assert report.losses == ("link 'left_wheel': friction 1 is used across too, in place of mu2 0.2",)
-
-
 # --- sensors --------------------------------------------------------------------------------------
 
 IMU = """<sensor name="imu" type="imu"><update_rate>100</update_rate><pose>0.1 0 0.2 0 0 1.5708</pose><imu>
@@ -283,12 +263,6 @@ def test_a_controllers_settings_become_the_drive_of_the_robot(tmp_path):
     )
     assert (spec.command_timeout_s, spec.odometry_rate_hz) == (0.25, 40)
     assert spec.alpha_max == 7.725  # its limit is switched off, so it is not used
-
-
-def test_settings_that_are_missing_are_a_loss_that_names_them(tmp_path):
-    _stage, robot, report = cart(tmp_path, CONTROL)
-    assert not prims_with(robot, "drive")
-    assert any("control.yaml" in loss for loss in report.losses)
 
 
 @pytest.mark.parametrize(

@@ -161,15 +161,6 @@ def test_limits_and_mimic_of_a_follower_are_authored_as_described_and_come_back(
     assert_same_kinematics(path, before, after, back, 1e-12)
 
 
-def test_shapes_come_back_where_they_were_in_their_colours(tmp_path):
-    _, after, _ = there_and_back(every(tmp_path), tmp_path)
-    (tube,), (box,) = after.links["arm"].visuals, after.links["arm"].collisions
-    assert (tube.name, tube.geometry.radius, tube.geometry.length) == ("tube", 0.03, 0.4)
-    assert_allclose(tube.material.rgba, (0.8, 0.1, 0.1, 1), atol=1e-3)
-    assert_allclose(origin_of(tube)[:3, 3], (0.1, 0, 0.2), rtol=0, atol=1e-12)
-    assert_allclose(box.geometry.size, (0.1, 0.2, 0.3), rtol=0, atol=1e-7)
-
-
 def test_the_robot_of_a_scene_is_written_as_it_stands_in_its_own_frame(tmp_path):
     write_urdf(shipped("scenes", "lab", "lab.usda"), tmp_path / "robot.urdf")
     urdf = shipped("robots", "turtlebot4", "turtlebot4.urdf")
@@ -332,13 +323,6 @@ def test_a_mimic_names_its_leader_as_the_urdf_does_even_if_prims_share_a_name(tm
 @pytest.mark.parametrize("name", ["a\\x01b", "a\\x1b[31m", "a\ufffe", "\u202eknil", "a\\nb", ""])
 def test_a_display_name_that_cannot_be_printed_gives_way_to_the_name_of_the_prim(tmp_path, name):
     assert small(tmp_path, NAME=name).find("link").get("name") == "base_link"
-
-
-def test_other_display_names_are_kept_and_cut_for_files(tmp_path):
-    name = "Räder <&> 1" + "x" * 400
-    link = small(tmp_path, NAME=name, BODY=MARKED.replace("FORM", "")).find("link")
-    assert link.get("name") == name
-    assert (tmp_path / "out" / link.find("visual/geometry/mesh").get("filename")).is_file()
 
 
 @pytest.mark.parametrize("limit", ["", "-inf", "None"])

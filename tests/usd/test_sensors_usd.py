@@ -21,7 +21,6 @@ from magtwin.spec.sensors import (
     MocapSpec,
 )
 from magtwin.usd import sensors
-from magtwin.usd.attributes import read_pose
 
 LINK = "/robot/some_link"
 
@@ -160,42 +159,6 @@ def test_a_sensor_is_placed_where_the_spec_says():
     assert Gf.IsClose(world.Transform(Gf.Vec3d(1, 0, 0)), Gf.Vec3d(1, 3, 4), 1e-12)
 
 
-def test_a_pose_that_others_wrote_as_a_matrix_is_read():
-    stage = stage_with_link()
-    matrix = Gf.Matrix4d(Gf.Rotation(Gf.Vec3d(0, 0, 1), 90), Gf.Vec3d(1, 2, 3))
-    UsdGeom.Xformable(stage.GetPrimAtPath(LINK)).MakeMatrixXform().Set(matrix)
-    p, q = read_pose(stage.GetPrimAtPath(LINK))
-    assert p == (1, 2, 3)
-    assert q == pytest.approx((0, 0, 0.5**0.5, 0.5**0.5))
-
-
-def test_a_turn_that_others_wrote_in_single_or_half_precision_is_read_at_unit_length():
-    stage = stage_with_link()
-    for kind, quaternion in (("half", Gf.Quath), ("single", Gf.Quatf)):
-        prim = sensors.define_imu(stage, f"{LINK}/{kind}", ImuSpec(link="some_link"))
-        prim.RemoveProperty("xformOp:orient")
-        names = {"half": Sdf.ValueTypeNames.Quath, "single": Sdf.ValueTypeNames.Quatf}
-        prim.CreateAttribute("xformOp:orient", names[kind], custom=False).Set(quaternion(0.6, 0.8, 0, 0))
-        q = sensors.read_imu(prim).q_link_sensor_xyzw
-        assert np.linalg.norm(q) == pytest.approx(1, abs=1e-15)
-        assert q == pytest.approx((0.8, 0, 0, 0.6), abs=5e-4)
-
-
-def test_every_figure_is_authored_also_one_that_equals_the_schemas_fallback():
-    stage = stage_with_link()
-    battery = sensors.define_battery(stage, "/robot/battery", BatterySpec())
-    magnetometer = sensors.define_magnetometer(stage, f"{LINK}/mag", MagnetometerSpec(link="some_link"))
-    platform = sensors.define_platform(stage.GetPrimAtPath("/robot"), PlatformFieldSpec())
-    footprint = sensors.define_footprint(stage.GetPrimAtPath("/robot"), 0.171)
-    for prim, noun in ((battery, "battery"), (platform, "platform"), (footprint, "robot:footprint")):
-        figures = [a for a in prim.GetAttributes() if a.GetName().startswith(f"magtwin:{noun}")]
-        assert figures
-        assert all(a.HasAuthoredValue() for a in figures)
-    figures = [a for a in magnetometer.GetAttributes() if a.GetName().startswith("magtwin")]
-    unsaid = {a.GetName().split(":")[-1] for a in figures if not a.HasAuthoredValue()}
-    assert unsaid == {"network", "networkSha256", "inputs", "mapSha256"}, "what is empty says nothing"
-
-
 def test_a_layer_over_a_sensor_holds_only_what_it_changes():
     stage = stage_with_link()
     spec = MagnetometerSpec(
@@ -244,18 +207,6 @@ def test_nvidias_imu_and_lidar_carry_what_they_can():
     assert omni.GetAttribute("omni:sensor:Core:patternFiringRateHz").Get() == 720 * 8
     assert omni.GetAttribute("omni:sensor:Core:scanRateBaseHz").Get() == 8
     assert omni.GetAttribute("omni:sensor:Core:farRangeM").Get() == 8.0
-
-
-def test_a_missing_network_is_read_as_where_it_should_be(tmp_path):
-    (tmp_path / "a").mkdir()
-    stage = Usd.Stage.CreateNew(str(tmp_path / "a" / "s.usda"))
-    UsdGeom.Xform.Define(stage, LINK)
-    spec = MagnetometerSpec(link="some_link", network=tmp_path / "gone.safetensors")
-    prim = sensors.define_magnetometer(stage, f"{LINK}/mag", spec)
-    assert sensors.read_magnetometer(prim) == spec
-    over = Usd.Stage.CreateNew(str(tmp_path / "over.usda"))
-    over.GetRootLayer().subLayerPaths.append("./a/s.usda")
-    assert sensors.read_magnetometer(over.GetPrimAtPath(f"{LINK}/mag")) == spec
 
 
 def battery_of_text(stage):
