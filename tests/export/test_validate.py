@@ -167,6 +167,17 @@ def test_the_command_says_clean_by_its_exit_status_and_in_json(lab, tmp_path, ca
     assert all(c["result"] == "passed" for c in printed[0]["checks"])
 
 
+def test_the_command_shows_rule_prim_and_what_to_do_and_exits_1(lab, capfd, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    file = beside(lab, "off", over(ROBOT, f"{TRANSLATE} = (9, 0, 0)"))
+    with pytest.raises(SystemExit) as e:
+        main(["validate", str(file), "--against", "magtwin"])
+    assert e.value.code == 1
+    printed = capfd.readouterr().out
+    assert "error magtwin robot-inside /World/turtlebot4: stands at (9, 0) m" in printed
+    assert "start it on the floor" in printed
+
+
 def test_validators_that_are_not_installed_say_how_to_get_them(lab, tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(others, "_programs", lambda: str(tmp_path))
     monkeypatch.setenv("PATH", str(tmp_path))

@@ -74,6 +74,21 @@ def test_friction_bounce_and_compliance_reach_the_collider(tmp_path):
     assert_valid(tmp_path / "cart.usda", tmp_path)
 
 
+@pytest.mark.parametrize(
+    "tags", ["<mu1>0.7</mu1><selfCollide>true</selfCollide>", '<mu1 value="0.7"/><selfCollide value="1"/>']
+)
+def test_a_figure_may_be_in_the_attribute_value_and_one_link_that_collides_with_its_robot_switches_all(
+    tmp_path, tags
+):
+    _, robot, report = cart(tmp_path, on("left_wheel", tags))
+    collider = robot.GetPrimAtPath("left_wheel/collisions").GetChildren()[0]
+    grip = UsdShade.MaterialBindingAPI(collider).ComputeBoundMaterial("physics")[0].GetPrim()
+    assert_allclose(grip.GetAttribute("physics:staticFriction").Get(), 0.7, rtol=1e-6)
+    for name in ("newton:selfCollisionEnabled", "physxArticulation:enabledSelfCollisions"):
+        assert robot.GetPrimAtPath("base_link").GetAttribute(name).Get() is True
+    assert not report.unknown_tags
+
+
 # --- sensors --------------------------------------------------------------------------------------
 
 IMU = """<sensor name="imu" type="imu"><update_rate>100</update_rate><pose>0.1 0 0.2 0 0 1.5708</pose><imu>

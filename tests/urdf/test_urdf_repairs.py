@@ -147,11 +147,7 @@ FAULTY = {
         (look(f'{BALL}<material name="m"><color rgba="255 0 0 1"/></material>'), 2, "reduced to it"),
         (tagged("<mu1>-1</mu1>"), 3, "mu1 -1 is below 0: raised to it"),
         (sensor("imu", NOISE.format("-0.3")), 4, "stddev -0.3 is below 0: raised to it"),
-        (
-            wheels(left="j", right="k", more="<wheel_radius>0</wheel_radius>"),
-            9,
-            "wheel_radius 0 is not above",
-        ),
+        (wheels(left="j", right="k", more="<wheel_radius>0</wheel_radius>"), 9, "wheel_radius 0 is not"),
     ],
     "number-count": [
         (look(f'<origin xyz="1 2 3 0"/>{BALL}'), 2, "has 4 numbers in '1 2 3 0': read as 1 2 3"),
@@ -166,11 +162,7 @@ FAULTY = {
         (tagged("<mu1>slippery</mu1>"), 3, "mu1 must be a finite number, not 'slippery'"),
     ],
     "element-unknown": [
-        (
-            BASE.format(TENSOR, "<colision/>"),
-            2,
-            "<colision> in <link> is unknown (did you mean 'coll",
-        ),
+        (BASE.format(TENSOR, "<colision/>"), 2, "<colision> in <link> is unknown (did you mean 'coll"),
         (look('<geometry><cylindre radius="1"/></geometry>'), 2, "(did you mean 'cylinder'?)"),
         (f"{GOOD}\n<transmision/>", 3, "<transmision> in <robot> is unknown (did you mean 'transmission'?)"),
     ],

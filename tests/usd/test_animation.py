@@ -169,6 +169,14 @@ def test_a_run_that_cannot_be_played_is_refused_and_nothing_is_written(columns, 
     assert not list(tmp_path.iterdir())
 
 
+def test_a_part_of_the_scene_is_never_replaced_by_what_plays_in_it(run, lab_scene):
+    before = lab_scene.read_bytes()
+    for part in (lab_scene, lab_scene.with_name("room.usda")):
+        with pytest.raises(InputError, match="is a part of the scene; give another name"):
+            write_animation(run, part, lab_scene, force=True)
+    assert lab_scene.read_bytes() == before
+
+
 def test_files_that_play_nothing_or_are_damaged_are_refused(played, lab_scene, tmp_path):
     with pytest.raises(InputError, match="plays no run: it has no prim /World/Run"):
         read_animation(lab_scene)

@@ -159,9 +159,7 @@ def test_a_map_that_comes_by_reference_is_not_adopted(room, tmp_path):
     file = building(tmp_path, room, LabA=TURNED)
     with pytest.raises(InputError, match="no sublayer of this stage, so it cannot be replaced here"):
         survey_scene(file, tmp_path / "new.usdc", adopt=True, headings_rad=[0.0])
-    with pytest.raises(
-        InputError, match=r"new\.usdc: is not in the folder of .*; write the map into .*room$"
-    ):
+    with pytest.raises(InputError, match="write the map into"):
         survey_scene(room, tmp_path / "new.usdc", adopt=True, headings_rad=[0.0])
     assert not (tmp_path / "new.usdc").exists()
 

@@ -142,6 +142,15 @@ def test_display_colours_of_every_interpolation_reach_the_right_points(stage, ki
         assert_allclose(shape.vertex_colours[:, 0], shape.vertices[:, 0] / 2)
 
 
+def test_colliders_and_hidden_things_are_not_shown(stage):
+    UsdGeom.Cube.Define(stage, "/guide").CreatePurposeAttr("guide")
+    UsdGeom.Cube.Define(stage, "/proxy").CreatePurposeAttr("proxy")
+    UsdGeom.Cube.Define(stage, "/shown").CreatePurposeAttr("render")
+    UsdGeom.Xform.Define(stage, "/hidden").CreateVisibilityAttr("invisible")
+    UsdGeom.Cube.Define(stage, "/hidden/cube")
+    assert [s.prim for s in read_shapes(stage)] == ["/shown"]
+
+
 def test_instances_are_shown_each_in_its_place(stage):
     stage.CreateClassPrim("/_post")
     UsdGeom.Cube.Define(stage, "/_post/cube").CreateSizeAttr(1.0)

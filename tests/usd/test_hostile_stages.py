@@ -84,16 +84,8 @@ REFUSED = [
     (with_('string xformOp:translate = "x"'), open_stage, r"</World> has xformOp:\S+ as .*; correct it"),
     (with_("double xformOp:rotateXYZ:first = 1"), open_stage, r"</World> has xformOp:\S+ as .*; correct it"),
     (with_("double3 xformOp:rotateX = (1, 2, 3)"), open_stage, r"</World> has xformOp:\S+ as .*; correct it"),
-    (
-        with_("quatf[] xformOp:orient = [(1, 0, 0, 0)]"),
-        open_stage,
-        r"</World> has xformOp:\S+ as .*; correct it",
-    ),
-    (
-        with_("matrix3d xformOp:transform:b:c = ((1, 0, 0), (0, 1, 0), (0, 0, 1))"),
-        open_stage,
-        r"</World> has xformOp:\S+ as .*; correct it",
-    ),
+    (with_("quatf[] xformOp:orient = [(1, 0, 0, 0)]"), open_stage, "has xformOp"),
+    (with_("matrix3d xformOp:transform:b:c = ((1, 0, 0), (0, 1, 0), (0, 0, 1))"), open_stage, "has xformOp"),
     (prim("Mesh", 'string[] points = ["a"]'), open_stage, "</World> has .*points as string"),
     (prim("Cube", 'string[] primvars:displayColor = ["a"]'), open_stage, "displayColor as string"),
     (prim("Cube", 'string physics:mass = "a"', MASS), open_stage, "mass as"),

@@ -231,43 +231,15 @@ TURN = Gf.Quatd(1, 1, 0, 0)
 @pytest.mark.parametrize(
     ("noun", "change", "words"),
     [
-        (
-            "battery",
-            put("/robot/battery", "magtwin:battery:capacityWh", -1.0),
-            "battery>: capacity_wh .* above 0",
-        ),
-        (
-            "battery",
-            put("/robot/battery", "magtwin:battery:loadW", float("nan")),
-            "load_w .* finite, got nan",
-        ),
-        (
-            "battery",
-            put("/robot/battery", "magtwin:battery:voltageFullV", 5.0),
-            "voltage_full_v .*voltage_empty_v",
-        ),
+        ("battery", put("/robot/battery", "magtwin:battery:capacityWh", -1.0), "capacity_wh"),
+        ("battery", put("/robot/battery", "magtwin:battery:loadW", float("nan")), "finite, got nan"),
+        ("battery", put("/robot/battery", "magtwin:battery:voltageFullV", 5.0), "voltage_empty_v"),
         ("battery", battery_of_text, "magtwin:battery:loadW must be a double, got"),
-        (
-            "imu",
-            put(f"{LINK}/imu", "magtwin:imu:gyroNoiseStdRadPerS", float("inf")),
-            "link/imu>: gyro_noise_std",
-        ),
-        (
-            "imu",
-            put(f"{LINK}/imu", "xformOp:orient", TURN),
-            "link/imu>: q_link_sensor_xyzw .* unit quaternion",
-        ),
-        (
-            "lidar",
-            put(f"{LINK}/lidar", "magtwin:lidar:rangeMinM", 12.0),
-            "link/lidar>: range_min_m .* range_max_m",
-        ),
+        ("imu", put(f"{LINK}/imu", "magtwin:imu:gyroNoiseStdRadPerS", float("inf")), "gyro_noise_std"),
+        ("imu", put(f"{LINK}/imu", "xformOp:orient", TURN), "q_link_sensor_xyzw"),
+        ("lidar", put(f"{LINK}/lidar", "magtwin:lidar:rangeMinM", 12.0), "range_min_m"),
         ("drive", one_joint, "</robot>: right_wheel_joint .* differ"),
-        (
-            "drive",
-            lambda stage: stage.RemovePrim("/robot/joints/left_wheel_joint"),
-            "leftWheelJoint must point",
-        ),
+        ("drive", lambda stage: stage.RemovePrim("/robot/joints/left_wheel_joint"), "leftWheelJoint must"),
         ("plain", lambda stage: None, "</robot>: has no MagtwinBatteryAPI"),
     ],
 )

@@ -253,11 +253,7 @@ def test_what_cannot_be_a_source_is_refused_by_prim(change, words):
 @pytest.mark.parametrize(
     ("attribute", "value", "words"),
     [
-        (
-            "faceVertexIndices",
-            [0, 2, 1, 0, 1, 3, 1, 2, 3, 0, 3, 1],
-            "not a closed mesh: the edge from .* to ",
-        ),
+        ("faceVertexIndices", [0, 2, 1, 0, 1, 3, 1, 2, 3, 0, 3, 1], "not a closed mesh: the edge from"),
         ("faceVertexIndices", [0, 2, 1, 0, 1, 3, 1, 2, 3, 0, 3, 9], "12 indices and 4 points do not fit"),
         ("faceVertexCounts", [3, 3, 3], "9 corners, 12 indices and 4 points do not fit"),
         ("points", [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)], "encloses no volume"),
@@ -301,9 +297,7 @@ def test_names_that_are_none_are_refused_by_the_near_one_and_steel_is_counted():
         define_source(world(), "/World", SourceSpec(name="steel beam", p_world=(0, 0, 0), m_world=(0, 0, 1)))
     with pytest.raises(InputError, match="no furniture 'dsek'; did you mean 'desk'"):
         FurnitureSpec(name="a", kind="dsek", p_world=(0, 0, 0))
-    with pytest.raises(
-        InputError, match=r"magnetization .* one number for each of leg_0, leg_1, .*rail_1, got"
-    ):
+    with pytest.raises(InputError, match="one number for each of leg_0, leg_1"):
         FurnitureSpec(name="a", kind="desk", p_world=(0, 0, 0), magnetization=(1e3,))
 
 
