@@ -62,16 +62,8 @@ def test_the_asset_gives_the_settings_back(links):
     settings = read_settings(HOME / "robot.toml")
     robot = load_robot(ASSET)
     assert robot.asset == ASSET
-    for name in (
-        "name",
-        "footprint_radius_m",
-        "drive",
-        "battery",
-        "platform",
-        "magnetometer",
-        "imu",
-        "lidar",
-    ):
+    names = ("name", "footprint_radius_m", "drive", "battery", "platform", "magnetometer", "imu", "lidar")
+    for name in names:
         assert getattr(robot, name) == getattr(settings, name)
     assert robot.base_height_m == pytest.approx(links["base_link"].p_world_link[2], abs=1e-12)
     assert robot.base_height_m == pytest.approx(0.03575 - 0.0402, abs=1e-12)  # the wheels touch the floor

@@ -227,21 +227,7 @@ def test_the_command_prints_a_line_per_localizer(warm, suite, tmp_path, capsys):
     assert made["figures"]["runs"]["value"] == 4
     assert made["figures"]["failed"]["value"] == 2
     assert made["metadata"]["localizers"]["exact, bad_localizers:Raises"].startswith("no run finished")
-    main(
-        [
-            "bench",
-            str(suite),
-            "--out",
-            str(out),
-            "--shard",
-            "5/7",
-            "--jobs",
-            "1",
-            "--only",
-            "exact",
-            "--quiet",
-        ]
-    )
+    main(f"bench {suite} --out {out} --shard 5/7 --jobs 1 --only exact --quiet".split())
 
 
 def refused(*arguments, capsys):

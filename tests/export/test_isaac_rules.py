@@ -32,38 +32,6 @@ FOUND = {
 }
 """A prim of `ROBOT` at which each rule finds an error."""
 
-OWN_RULES = """
-import carb
-import omni.nothing.known
-import omni.client
-from omni.asset_validator.core import BaseRuleChecker, registerRule
-from pxr import PhysxSchema
-
-@registerRule("Ours")
-class Names(BaseRuleChecker):
-    def CheckPrim(self, prim):
-        if prim.HasAPI(PhysxSchema.PhysxArticulationAPI):
-            self._AddWarning(message="an articulation", at=prim)
-
-@registerRule("Ours")
-class Breaks(BaseRuleChecker):
-    def CheckStage(self, stage):
-        stage.GetSessionLayer().Clear()
-        raise KeyError("broken")
-
-@registerRule("IsaacSim.RobotRules")
-class Steps(BaseRuleChecker):
-    def CheckStage(self, stage):
-        omni.nothing.known.simulate(carb.settings)
-
-@registerRule("IsaacSim.RobotRules")
-class Lists(BaseRuleChecker):
-    def CheckStage(self, stage):
-        result, entries = omni.client.list(stage.GetRootLayer().realPath + "/..")
-        if result != omni.client.Result.OK:
-            self._AddInfo(message="no folder")
-"""
-
 
 @pytest.fixture
 def robot(tmp_path):
@@ -143,21 +111,6 @@ def test_the_makers_description_of_the_turtlebot_4_converts_without_an_error(
     check = isaac(asset, {"/turtlebot4": asset})
     assert errors(check) == []
     assert check.scope.startswith("23 of 24 rules")
-
-
-def test_a_rule_sees_schemas_without_plugins_and_one_that_fails_or_needs_kit_ends_nothing(own_rules, robot):
-    own_rules(OWN_RULES)
-    robot.write_text(ROBOT.replace('"IsaacRobotAPI",', '"IsaacRobotAPI", "PhysxArticulationAPI",'))
-    check = isaac(robot, {"/bot": robot})
-    assert [(f.rule, f.where, f.severity) for f in check.findings] == [
-        ("Breaks", "/bot", "error"),
-        ("Lists", "/bot", "note"),
-        ("Names", "/bot", "warning"),
-        ("not-run", "", "note"),
-    ]
-    assert check.findings[0].text == "the rule failed: KeyError: 'broken'"
-    assert check.findings[-1].text == "Steps: needs Isaac Sim itself (omni.nothing.known.simulate)"
-    assert check.scope == "3 of 4 rules of isaacsim.asset.validation 1.3.6"
 
 
 def test_a_finding_in_a_variant_that_is_not_chosen_names_its_prim(own_rules, tmp_path):

@@ -18,6 +18,7 @@ from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.export.validation.findings import Check, Finding, Findings, check_from
 from magtwin.export.validation.rule import RULES, Subject
+from magtwin.export.validation.rules import robot_assets
 from magtwin.export.validation.validate import validate
 from magtwin.learn.data.features import FEATURES
 
@@ -137,6 +138,15 @@ def test_the_docs_list_every_rule_with_its_sentence():
     text = (DOCS / "validate.md").read_text()
     for rule in EVERY.values():
         assert f"| `{rule.name}` | {rule.sentence} | {rule.advice} |" in text
+
+
+def test_a_robots_asset_is_found_for_the_profiles_that_are_for_it(lab, tmp_path):
+    (asset,) = robot_assets(subject(lab)).values()
+    assert asset.name == "turtlebot4.usda"
+    assert robot_assets(subject(asset)) == {"/turtlebot4": asset}
+    flat = tmp_path / "flat.usdc"
+    Usd.Stage.Open(str(lab)).Export(str(flat))
+    assert robot_assets(subject(flat)) == {"/World/turtlebot4": None}
 
 
 # --- the answer -----------------------------------------------------------------------------------

@@ -171,18 +171,6 @@ def test_after_readings_of_another_place_odometry_leads_back_to_the_pose():
     assert back >= 3
 
 
-def test_a_pose_off_the_floor_is_given_up():
-    pose = circle(150)
-    problem, readings = drive(FIELD, pose, 14)
-    astray = replace(problem, prior=Prior(mean=(EXTENT[1] + 2.0, EXTENT[3] + 1.0, 0.0)))
-    made = estimates(RaoBlackwellIron(), astray, readings)
-    assert made[20].lost
-    assert not made[-1].lost
-    assert np.hypot(*(poses(made)[-25:, :2] - pose[-25:, :2]).T).max() < 0.25
-    stubborn = estimates(RaoBlackwellIron(resets=False), astray, readings)
-    assert np.hypot(*(poses(stubborn)[-1, :2] - pose[-1, :2])) > 1.0
-
-
 @settings(max_examples=8)
 @given(
     x=st.floats(-5, 5),

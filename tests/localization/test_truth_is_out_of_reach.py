@@ -16,16 +16,8 @@ from magtwin.localization.readings import onboard, readings_of
 from magtwin.localization.track import LocalizerError, track
 from magtwin.run.run import Run
 
-TRUE = (
-    "p_world_base",
-    "q_world_base_xyzw",
-    "yaw",
-    "v_base",
-    "w_base",
-    "b_truth_nt",
-    "b_map_nt",
-    "b_total_nt",
-)
+TRUE = ("p_world_base", "q_world_base_xyzw", "yaw", "v_base", "w_base")
+TRUE += ("b_truth_nt", "b_map_nt", "b_total_nt")
 """Columns that no localizer may see."""
 
 

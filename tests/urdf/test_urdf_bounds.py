@@ -147,18 +147,6 @@ def test_a_fault_of_a_yaml_is_refused_in_one_line_by_all_that_read_it(text, tmp_
         read_source(source)
 
 
-def test_numbers_to_base_sixty_are_texts(tmp_path):
-    long = ":".join(["59"] * 10_000)
-    path = tmp_path / "a.yaml"
-    path.write_text(f"a: 1:30\nb: 1:30.5\nc: {long}\nd: -1.5e+3\ne: 0x1f\nf: 12:30:45\ng: .inf\nh: 1_000\n")
-    (table,) = read_settings(path)
-    assert table == {"a": "1:30", "b": "1:30.5", "c": long, "d": -1500, "e": 31} | {
-        "f": "12:30:45",
-        "g": float("inf"),
-        "h": 1000,
-    }
-
-
 def test_aliases_of_tables_do_not_multiply(tmp_path):
     path = tmp_path / "a.yaml"
     names = [f"k{i}" for i in range(200)]

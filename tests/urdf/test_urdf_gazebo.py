@@ -228,15 +228,8 @@ def test_a_drive_plugin_becomes_the_drive_of_the_robot(tmp_path):
     _stage, robot, report = cart(tmp_path, GZ)
     spec = read_drive(robot)
     assert (spec.left_wheel_joint, spec.right_wheel_joint) == ("left", "right")
-    figures = (
-        spec.wheel_separation_m,
-        spec.wheel_radius_m,
-        spec.v_max,
-        spec.w_max,
-        spec.a_max,
-        spec.alpha_max,
-    )
-    assert figures == (0.31, 0.041, 0.5, 2, 1.5, 6)
+    assert (spec.wheel_separation_m, spec.wheel_radius_m) == (0.31, 0.041)
+    assert (spec.v_max, spec.w_max, spec.a_max, spec.alpha_max) == (0.5, 2, 1.5, 6)
     assert spec.odometry_rate_hz == 20
     assert robot.GetAttribute("isaac:robotType").Get() == "Wheeled"
     assert not report.unknown_tags

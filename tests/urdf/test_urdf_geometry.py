@@ -741,14 +741,3 @@ def test_a_buffer_outside_the_package_is_refused(tmp_path):
     path.write_text(path.read_text().replace("shape.bin", "../shape.bin"))
     with pytest.raises(InputError, match=r"buffer '\.\./shape\.bin' lies outside the robot's packages; move"):
         robot(inside, visual("t.gltf"))
-
-
-def test_bytes_are_the_same_each_time(tmp_path):
-    picture(tmp_path / "tiles.png")
-    file = squares(tmp_path, MTL + "map_Kd tiles.png\n")
-    once = {}
-    for _ in range(2):
-        robot(tmp_path, visual(file) + collision(gltf(tmp_path / "t.glb").name))
-        files = {p.name: p.read_bytes() for p in sorted((tmp_path / "out").rglob("*")) if p.is_file()}
-        assert files == (once or files)
-        once = files

@@ -211,7 +211,7 @@ def test_invalid_metadata_is_refused(tmp_path, given, message):
 # --- gates ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", sorted(set(VARIANTS) - {"physx"}))  # the default, in every other test
 def test_every_variant_passes_the_validators(tmp_path, variant):
     out = convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda")
     text = out.read_text()

@@ -137,18 +137,6 @@ def test_a_spec_survives_the_stage_to_the_bit(noun, data):
     assert read(prim) == spec
 
 
-@unhurried
-@given(st.data())
-def test_a_drive_survives_the_stage(data):
-    names = data.draw(st.lists(name, min_size=2, max_size=5, unique=True))
-    joints = dict(zip(sensors.JOINT_FIELDS, names, strict=False))
-    joints |= dict(zip(sensors.WHEELS_FIELDS, (tuple(names[2:3]), tuple(names[3:])), strict=True))
-    known = {field: st.just(value) for field, value in joints.items()}
-    spec = data.draw(figures_of(DriveSpec, **known, yaw_slip=st.just(0.25), slip_s2_m=st.just(0.0)))
-    stage = stage_with_wheels(spec)
-    assert sensors.read_drive(sensors.define_drive(stage.GetPrimAtPath("/robot"), spec)) == spec
-
-
 def test_a_sensor_is_placed_where_the_spec_says():
     stage = stage_with_link()
     UsdGeom.XformCommonAPI(stage.GetPrimAtPath(LINK)).SetTranslate((0, 0, 1))

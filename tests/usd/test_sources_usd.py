@@ -78,13 +78,6 @@ def the_source(stage: Usd.Stage, of: SourceSpec = BAR) -> Usd.Prim:
 
 
 @unhurried
-@given(st.builds(SourceSpec, name=name, p_world=vec3, m_world=vec3))
-def test_a_dipole_survives_the_stage(spec):
-    stage = stage_of(spec)
-    assert read_magnets(stage) == ((spec,), ())
-
-
-@unhurried
 @given(st.sampled_from(sorted(sizes)), st.data())
 def test_a_body_survives_the_stage_to_the_bit(shape, data):
     spec = SourceSpec(
@@ -107,23 +100,6 @@ def test_a_mesh_survives_the_stage_to_the_bit(corners, turn, magnetization):
     except InputError:  # flat or inside out
         return
     assert read_magnets(stage_of(spec)) == ((spec,), ())
-
-
-@unhurried
-@given(st.sampled_from(sorted(KINDS)), vec3, unit, st.floats(-1e4, 1e4), st.floats(0, 1e3))
-def test_furniture_survives_the_stage_as_furniture(kind, p, turn, strength, susceptibility):
-    steel = sum(part.steel for part in parts_of(kind))
-    spec = FurnitureSpec(
-        name="piece",
-        kind=kind,
-        p_world=p,
-        q_world_xyzw=turn,
-        magnetization=tuple(strength + k for k in range(steel)),
-        susceptibility=susceptibility,
-    )
-    stage = world()
-    define_furniture(stage, (spec,))
-    assert read_magnets(stage) == ((), (spec,))
 
 
 # Where things stand

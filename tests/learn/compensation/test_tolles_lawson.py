@@ -11,11 +11,9 @@ from places import DOCS
 from scipy.signal import butter, sosfilt, sosfilt_zi
 from scipy.spatial.transform import Rotation
 
-from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files.file import shipped
-from magtwin.io.tables import write_parquet
 from magtwin.learn.compensation.tolles_lawson import (
     TollesLawson,
     band_pass,
@@ -209,15 +207,6 @@ def test_what_cannot_be_fitted_is_refused(change, says):
     given = {"b_nt": np.linalg.norm(b, axis=1), "b_vector_nt": b, "rate_hz": RATE_HZ, **change}
     with pytest.raises(InputError, match=says):
         fit_tolles_lawson(**given)
-
-
-def test_compensate_takes_a_preset_and_keeps_it(calibration, tmp_path, capsys):
-    run, model = tmp_path / "run.parquet", tmp_path / "model.json"
-    write_parquet(calibration("figure8", 1), run)
-    main(["compensate", "fit", str(run), "--preset", "magnav", "--no-band", "--out", str(model), "--json"])
-    assert json.loads(capsys.readouterr().out)["metadata"]["preset"] == "magnav"
-    assert TollesLawson.load(model).preset == "magnav"
-    assert TollesLawson.load(model) == fit_run(calibration("figure8", 1), band_hz=None, preset="magnav")
 
 
 def test_the_page_on_compensation_takes_out_what_it_says():

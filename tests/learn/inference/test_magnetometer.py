@@ -75,15 +75,6 @@ def test_one_thread_and_two_give_the_same_bytes_and_the_number_of_threads_stays(
         assert_array_equal(paper.net.predict(x)[0], two)
 
 
-def test_nan_in_gives_nan_out_in_that_row_alone(paper):
-    x = inputs(paper.net, 600)
-    clean = paper.net.predict(x)[0]
-    x[[3, 555], [0, 19]] = np.nan
-    y = paper.net.predict(x)[0]
-    assert_array_equal(np.flatnonzero(np.isnan(y)), [3, 555])
-    assert_array_equal(np.delete(y, [3, 555]), np.delete(clean, [3, 555]))
-
-
 def test_an_input_beyond_its_training_range_is_outside():
     net = a_net(["battery_fraction", "imu_w_z"])
     net.inputs = replace(net.inputs, low=np.array([0.2, -1.0]), high=np.array([1.0, 1.0]))

@@ -93,21 +93,9 @@ def test_the_network_knows_its_training_ranges():
 )
 def test_what_cannot_be_trained_on_is_refused(change, text):
     x, y = rows(50, 0)
+    given = SMALL | {"y": y, "rng": np.random.default_rng(0), "epochs": 2} | change
     with pytest.raises(InputError, match=text):
-        train(
-            **(
-                {
-                    "x": x,
-                    "y": y,
-                    "x_val": x,
-                    "y_val": y,
-                    "rng": np.random.default_rng(0),
-                    **SMALL,
-                    "epochs": 2,
-                }
-                | change
-            )
-        )
+        train(x, x_val=x, y_val=y, **given)
 
 
 def same(a, b):
