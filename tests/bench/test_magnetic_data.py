@@ -7,12 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from magtwin.bench.magnetic_data import (
-    ARM_M,
-    IRON_NT,
-    magnetic_data_case,
-    read_recording,
-)
+from magtwin.bench.magnetic_data import ARM_M, IRON_NT, magnetic_data_case, read_recording
 from magtwin.errors import InputError
 from magtwin.localization.bounds import bounds
 from magtwin.localization.localizers import load_localizer

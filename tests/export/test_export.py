@@ -403,10 +403,7 @@ def aprilab(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return author_scene(scene, home / "aprilab")
 
 
-@pytest.mark.parametrize(
-    ("out", "profile"),
-    [("a.usdz", "isaac"), ("a", "viewer"), ("a.glb", "viewer")],
-)
+@pytest.mark.parametrize(("out", "profile"), [("a.usdz", "isaac"), ("a", "viewer"), ("a.glb", "viewer")])
 def test_the_aprilab_lab_exports_for_every_profile_with_the_licence_of_its_map(
     aprilab, out, profile, tmp_path
 ):

@@ -18,11 +18,7 @@ from magtwin.usd.layers import open_stage
 from magtwin.usd.scene import read_scene
 from magtwin.usd.schema import only_prim_with
 
-USD_TYPES = {
-    "execution": "uint",
-    "vectord[3]": "vector3d",
-    "quatd[4]": "quatd",
-}
+USD_TYPES = {"execution": "uint", "vectord[3]": "vector3d", "quatd[4]": "quatd"}
 """OmniGraph's types that USD calls otherwise."""
 
 ROLES = {"vectord[3]": "double[3]", "quatd[4]": "double[4]"}

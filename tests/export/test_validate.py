@@ -203,8 +203,7 @@ def test_validators_that_are_not_installed_say_how_to_get_them(lab, tmp_path, mo
 
 
 @pytest.mark.parametrize(
-    ("said", "result"),
-    [("Profile 'Sensor-IMU' is not registered", "not run"), ("it broke", "failed")],
+    ("said", "result"), [("Profile 'Sensor-IMU' is not registered", "not run"), ("it broke", "failed")]
 )
 def test_an_empty_report_of_simreadys_counts_as_passed_for_no_profile(
     lab, tmp_path, monkeypatch, said, result

@@ -7,11 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.stats import chi2
 
-from magtwin.localization.scores import (
-    anees_interval,
-    independent,
-    score,
-)
+from magtwin.localization.scores import anees_interval, independent, score
 from magtwin.localization.track import Track
 
 RATE = 5

@@ -218,12 +218,7 @@ def test_names_options_and_refusals():
     names = {"bootstrap": Bootstrap, "rbpf": RaoBlackwell, "rbpf-iron": RaoBlackwellIron}
     for name, made in {**names, "rbpf-network": RaoBlackwellNetwork}.items():
         assert type(load_localizer(name)) is made
-    for options in (
-        {"particles": 1},
-        {"particles": 10.5},
-        {"kappa": 0.0},
-        {"map_correlated": 2.0},
-    ):
+    for options in ({"particles": 1}, {"particles": 10.5}, {"kappa": 0.0}, {"map_correlated": 2.0}):
         with pytest.raises(InputError):
             RaoBlackwell(**options)
     with pytest.raises(InputError, match="did you mean 'particles'"):

@@ -85,8 +85,7 @@ def test_joints_without_limits_hold_a_position_where_they_bear_a_load(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("interfaces", "held"),
-    [(("velocity", "position"), True), (("effort",), True), (("velocity",), False)],
+    ("interfaces", "held"), [(("velocity", "position"), True), (("effort",), True), (("velocity",), False)]
 )
 def test_a_joint_with_limits_is_held_unless_it_takes_velocities_only(tmp_path, interfaces, held):
     """xArm and TIAGo take both: their arms sank by 7 and 36 mm/s. Those of Panda and PR2, by effort, fell."""

@@ -154,8 +154,7 @@ CAMERA = """<sensor name="eye" type="{type}"><update_rate>30</update_rate><pose>
 
 
 @pytest.mark.parametrize(
-    ("kind", "channels"),
-    [("camera", ["colour"]), ("depth", ["depth"]), ("rgbd_camera", ["colour", "depth"])],
+    ("kind", "channels"), [("camera", ["colour"]), ("depth", ["depth"]), ("rgbd_camera", ["colour", "depth"])]
 )
 def test_a_camera_keeps_its_view_resolution_range_and_direction(tmp_path, kind, channels):
     _stage, robot, _ = cart(tmp_path, on("eye", CAMERA.format(type=kind)))

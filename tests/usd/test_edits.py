@@ -287,11 +287,7 @@ def test_a_lab_that_does_not_stand_level_in_its_size_is_refused_by_prim(room, tm
     ("path", "change", "words"),
     [
         ("/World/Lab", lambda p: UsdGeom.XformCommonAPI(p).SetTranslate((1, 0, 0)), "Lab>: is moved"),
-        (
-            ROBOT,
-            lambda p: UsdGeom.Xformable(p).AddScaleOp().Set(Gf.Vec3f(2)),
-            "the robot is scaled",
-        ),
+        (ROBOT, lambda p: UsdGeom.Xformable(p).AddScaleOp().Set(Gf.Vec3f(2)), "the robot is scaled"),
         ("/World/AnomalyMap", lambda p: p.SetActive(False), "magnetometer:map must point to one prim"),
     ],
 )

@@ -171,7 +171,7 @@ UNAUTHORED = {
 
 EMPTY = {
     "anomalyMap": "valuesNt valid varianceNt2 recordedNt recordedYawRad shape headingsDeg checksum "
-    "parameters madeFrom heightM originM cellSizeM",
+    "parameters madeFrom heightM originM cellSizeM"
 }
 """Attributes of maps: unknown if empty, or refused, as test_schema_versions.py shows."""
 

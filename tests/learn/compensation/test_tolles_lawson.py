@@ -275,10 +275,7 @@ def test_the_preset_magnav_gives_its_arrays(penalty, tmp_path):
 def test_the_figures_of_both_reports_are_those_of_the_raw_arrays(calibration):
     run = calibration("figure8", seed=1)
     model = fit_run(run, band_hz=None, ridge=1e-6)
-    vector, field = (
-        run["b_vector_measured_nt"],
-        run["b_measured_nt"] - run["b_map_nt"],
-    )
+    vector, field = (run["b_vector_measured_nt"], run["b_measured_nt"] - run["b_map_nt"])
     fine = np.isfinite(field) & np.isfinite(vector).all(axis=1)
     assert fine[np.argmax(fine) :].all()  # so that the longest stretch is all of it
     b, y = vector[fine], field[fine]

@@ -5,15 +5,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
 from magtwin.learn.compensation.tolles_lawson import design_matrix
-from magtwin.learn.data.features import (
-    EDDY,
-    FEATURES,
-    FULL,
-    INDUCED,
-    SETS,
-    features,
-    warming,
-)
+from magtwin.learn.data.features import EDDY, FEATURES, FULL, INDUCED, SETS, features, warming
 from magtwin.run.run import COLUMNS, Run
 
 

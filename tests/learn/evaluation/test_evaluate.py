@@ -13,14 +13,7 @@ from magtwin.learn.data.features import features as features_of
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.recording import Source
 from magtwin.learn.data.split import split
-from magtwin.learn.evaluation.candidates import (
-    NAIVE,
-    Candidate,
-    Mean,
-    candidate_of,
-    naive,
-    named_map,
-)
+from magtwin.learn.evaluation.candidates import NAIVE, Candidate, Mean, candidate_of, naive, named_map
 from magtwin.learn.evaluation.evaluate import evaluate, trials_of, unlearned, unseen
 from magtwin.learn.training.config import TrainConfig
 from magtwin.learn.training.train import fit
