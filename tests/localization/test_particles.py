@@ -223,5 +223,10 @@ def test_names_options_and_refusals():
             RaoBlackwell(**options)
     with pytest.raises(InputError, match="did you mean 'particles'"):
         load_localizer("rbpf", {"particle": 5})
-    with pytest.raises(InputError, match="need a map"):
-        RaoBlackwell().reset(Problem(belief=None, extent=EXTENT, prior=Prior()))
+
+
+@pytest.mark.parametrize("name", ["rbpf", "ekf", "point-mass", "smoother"])
+def test_what_needs_a_map_is_refused_without_one(name):
+    method, blind = load_localizer(name), Problem(belief=None, extent=EXTENT, prior=Prior())
+    with pytest.raises(InputError, match="a map"):
+        method.run(blind, None) if name == "smoother" else method.reset(blind)
