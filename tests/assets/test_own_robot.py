@@ -84,28 +84,6 @@ def test_a_scene_that_does_not_fit_its_urdf_is_refused_and_nothing_is_written(
     assert [p.name for p in tmp_path.iterdir()] == ["mine.toml"]
 
 
-def test_keys_of_a_urdf_are_refused_beside_an_asset(tmp_path):
-    from magtwin.author.scene_file import scene_from_toml
-
-    asset = shipped("robots", "turtlebot4", "turtlebot4.usda")
-    file = scene(tmp_path, SCENE.replace(f'urdf = "{CART}"', f'asset = "{asset}"'))
-    with pytest.raises(InputError, match=r"\[robot\] drive goes with urdf; an asset has it already"):
-        scene_from_toml(file)
-
-
-def test_from_urdf_gives_asset_spec_and_report(tmp_path):
-    settings = RobotSettings(
-        drive=DriveSpec(left_wheel_joint="left", right_wheel_joint="right"),
-        magnetometer=MagnetometerSpec(link="mast"),
-    )
-    made = from_urdf(CART, tmp_path / "cart", settings=settings, single_file=True)
-    assert made.asset == tmp_path / "cart" / "cart.usda"
-    assert made.spec is not None
-    assert made.spec.drive.left_wheel_joint == "left"
-    assert made.report.mass_in_kg == pytest.approx(6.0)
-    assert any("lidar" in note for note in made.report.notes)
-
-
 def test_settings_name_links_and_joints_as_the_urdf_does_though_usd_calls_them_otherwise(tmp_path):
     text = CART.read_text().replace('"mast"', '"mast-top"').replace('"left"', '"left.wheel"')
     (tmp_path / "cart.urdf").write_text(text.replace('"right"', '"右"'))

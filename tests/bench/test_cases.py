@@ -77,15 +77,6 @@ def test_a_map_with_error_has_the_sd_and_the_length_that_the_localizer_is_told(f
     assert_allclose(same[0], same[7], atol=1e-9)  # alike at all headings
 
 
-def test_a_trilinear_map_states_its_error(field):
-    belief = world.trilinear(field, 0.5)
-    rng = np.random.default_rng(1)
-    p, yaw = rng.uniform((-2.5, -1.3), (2.5, 1.3), (5000, 2)), rng.uniform(-np.pi, np.pi, 5000)
-    error = belief.mean(p, yaw) - field.mean(p, yaw)
-    assert 200 < error.std() < 600
-    assert 0.8 < np.sqrt(np.mean(error**2 / belief.variance(p, yaw))) < 1.3
-
-
 def test_odometry_has_the_variances_of_its_model():
     pose = np.column_stack([np.linspace(0, 10, 501), np.zeros(501), np.zeros(501)])
     t = np.arange(501) / 5

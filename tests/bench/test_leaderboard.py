@@ -5,8 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from magtwin.bench.leaderboard import compare_rows, standings
-from magtwin.bench.report import describe, page_of_results
-from magtwin.bench.suite import load_suite
+from magtwin.bench.report import page_of_results
 from magtwin.errors import InputError
 from magtwin.figures.page import to_html
 
@@ -76,12 +75,6 @@ def test_an_unknown_start_counts_as_found_within_30_s_and_no_later():
     assert standing.converged.low < 0.9 < standing.converged.high
 
 
-def test_a_localizer_all_of_whose_runs_failed_has_no_error():
-    (standing,) = standings(rows_of("f", 0.1, failed=RUNS))
-    assert standing.rmse_m is None
-    assert standing.diverged.value == 1.0
-
-
 def test_a_smoother_is_measured_by_its_own_bound():
     rows = rows_of("f", 0.1)
     rows["smoother"][:] = True
@@ -132,12 +125,3 @@ def test_the_page_names_failures_and_escapes_names():
     titles = [table.title for table in page.sections[1].tables]
     assert titles == ["Accuracy", "Reliability", "Paired differences", "Failures"]
     assert "step raised ZeroDivisionError" in to_html(page)
-
-
-def test_a_scenario_is_described_by_what_its_suite_sets():
-    known = load_suite("standard").scenarios
-    assert describe(known["exact"]) == "300 runs of 90 s in 50 sessions."
-    assert "map_error_nt 150.0, sensor.iron_nt 400.0, kidnaps 2" in describe(known["kidnapped"])
-    assert describe(load_suite("ship").scenarios["loop-2"]).startswith(
-        "100 runs of recorded data. Set: source ship"
-    )

@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from magtwin.bench.magnetic_data import (
-    ARM_M,
-    IRON_NT,
-    course,
-    magnetic_data_case,
-    read_recording,
-)
+from magtwin.bench.magnetic_data import ARM_M, IRON_NT, magnetic_data_case, read_recording
 from magtwin.errors import InputError
 from magtwin.localization.bounds import bounds
 from magtwin.localization.localizers import load_localizer
@@ -57,28 +51,6 @@ def folder(tmp_path_factory):
         for what, table in (("time", t), ("loc", p), ("mag", field)):
             np.savetxt(made / f"{number}-{what}.csv", table, delimiter=",")
     return made
-
-
-def test_the_course_of_a_circle_is_its_tangent_and_of_a_standstill_the_last_one():
-    angle = np.linspace(0, 3 * np.pi, 3000)
-    p = np.column_stack([np.cos(angle), np.sin(angle)])
-    yaw = course(p)
-    inner = slice(40, -40)  # the ends have a chord to one side only
-    assert_allclose(yaw[inner], angle[inner] + np.pi / 2, atol=2e-3)
-    assert np.ptp(yaw) > 2.9 * np.pi  # continuous over more than a turn
-    stop = np.concatenate([p[:1500], np.repeat(p[1499:1500], 300, axis=0), p[1500:]])
-    assert_allclose(course(stop)[1500:1800], angle[1499] + np.pi / 2, atol=2e-3)
-
-
-def test_a_recording_begins_and_ends_in_motion(folder):
-    t, p, yaw = drive(1)
-    part = read_recording(folder, 1)
-    assert part.t[0] > t[0]
-    assert part.t[-1] < t[-1]
-    rows = np.searchsorted(t, part.t)
-    assert_allclose(part.p, p[rows])
-    off = np.angle(np.exp(1j * (part.yaw - yaw[rows])))
-    assert np.sqrt(np.mean(off**2)) < 0.02
 
 
 def test_a_case_tells_a_localizer_no_truth(folder):

@@ -69,14 +69,6 @@ def test_odometry_has_the_published_bias_and_noise(tmp_path):
     assert_allclose(case.truth.pose[:, :2], p[:, :2])
 
 
-def test_a_seed_gives_the_same_readings_and_no_truth(tmp_path):
-    made_up(tmp_path)
-    first, again, other = (ship_case(tmp_path, 1, seed).readings for seed in (4, 4, 6))
-    assert_allclose(first["odom_p"], again["odom_p"], rtol=0, atol=0)
-    assert np.abs(first["odom_p"] - other["odom_p"]).max() > 0.01
-    assert set(first) == {"t", "odom_p", "odom_q_xyzw", "b_measured_nt", "b_vector_measured_nt"}
-
-
 def test_wrong_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="loop"):
         ship_case(tmp_path, 5, 0)

@@ -131,22 +131,6 @@ def test_rows_are_in_the_order_of_the_suite_with_one_per_run(whole):
     assert "8 of them failed" in repr(results)
 
 
-def test_tracks_are_thinned_errors_whose_mean_square_is_that_of_the_row(whole):
-    results = read_results(whole)
-    (track,) = results.tracks("exact", "odometry", 3)
-    assert track["t"].dtype == np.float32
-    assert np.allclose(np.diff(track["t"]), 0.4)  # every second of 5 Hz
-    row = np.flatnonzero((results.rows["localizer"] == "odometry") & (results.rows["run"] == 3))[0]
-    assert np.sqrt(np.mean(track["error_m"] ** 2)) == pytest.approx(results.rows["rmse_m"][row], rel=0.3)
-    assert [each["run"] for each in results.tracks("global", "odometry")] == [0, 1, 2]
-    names = ("scenario", "localizer", "run")
-    assert [tuple(each[name] for name in names) for each in results.tracks()] == list(
-        zip(*(results.rows[name].tolist() for name in names), strict=True)
-    )
-    with pytest.raises(InputError, match="did you mean 'exact'"):
-        results.tracks("exat", "odometry")
-
-
 @pytest.mark.parametrize("shards", [1, 2, 7])
 def test_two_jobs_and_any_number_of_shards_give_the_bytes_of_one(warm, suite, whole, tmp_path, shards):
     out = tmp_path / "results"
@@ -243,21 +227,7 @@ def test_the_command_prints_a_line_per_localizer(warm, suite, tmp_path, capsys):
     assert made["figures"]["runs"]["value"] == 4
     assert made["figures"]["failed"]["value"] == 2
     assert made["metadata"]["localizers"]["exact, bad_localizers:Raises"].startswith("no run finished")
-    main(
-        [
-            "bench",
-            str(suite),
-            "--out",
-            str(out),
-            "--shard",
-            "5/7",
-            "--jobs",
-            "1",
-            "--only",
-            "exact",
-            "--quiet",
-        ]
-    )
+    main(f"bench {suite} --out {out} --shard 5/7 --jobs 1 --only exact --quiet".split())
 
 
 def refused(*arguments, capsys):
@@ -319,17 +289,6 @@ def test_results_on_other_inputs_are_refused(suite, tmp_path):
         with pytest.raises(InputError, match=f"another content of '{named}'"):
             check_about(results_folder, about(load_suite(file), load_suite(file)))
         changed.write_bytes(before)
-
-
-def test_force_replaces_results(warm, suite, tmp_path):
-    out = tmp_path / "results"
-    benchmark(suite, out, scenarios=["exact"], runs=1)
-    part = next(out.glob("rows/exact/*.parquet"))
-    part.write_bytes(part.read_bytes()[:100])
-    with pytest.raises(InputError, match="damaged"):
-        read_results(out)
-    results = benchmark(suite, out, scenarios=["exact"], runs=1, force=True)
-    assert len(results.rows["run"]) == 2
 
 
 def test_a_folder_without_results_is_refused(tmp_path):

@@ -30,17 +30,6 @@ def test_the_bootstrap_of_single_runs_is_scipys():
     assert made.value == pytest.approx(np.sqrt(np.mean(values**2)))
 
 
-def test_the_mean_over_sessions_has_the_standard_error_of_their_means():
-    rng = np.random.default_rng(1)
-    sessions = np.repeat(np.arange(60), 10)
-    values = rng.normal(size=60)[sessions] + 0.1 * rng.normal(size=600)
-    made = bootstrap(values, sessions, np.mean)
-    error = values.reshape(60, 10).mean(axis=1).std() / np.sqrt(60)
-    assert (made.high - made.low) / 2 == pytest.approx(1.96 * error, rel=0.05)
-    alone = bootstrap(values, range(600), np.mean)  # as if runs of a session were independent
-    assert (alone.high - alone.low) < 0.5 * (made.high - made.low)
-
-
 def test_runs_of_one_session_have_its_interval_and_one_run_has_none():
     values = np.random.default_rng(3).gamma(2, size=20)
     alone, one = bootstrap(values, range(20), np.mean), bootstrap(values, np.zeros(20), np.mean)

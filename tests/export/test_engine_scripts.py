@@ -38,10 +38,6 @@ def test_scripts_need_nothing_of_magtwin(script):
     assert not any(name.split(".")[0] in ("magtwin", "torch") for name in names)
 
 
-def test_the_script_for_isaac_sim_says_first_that_it_is_untested():
-    assert (SCRIPTS / "isaac_magnetometer.py").read_text().splitlines()[0].startswith('"""UNTESTED')
-
-
 def test_the_script_for_isaac_sim_is_sound_beside_stand_ins_for_isaac_sims_classes(lab_scene, tmp_path):
     pytest.importorskip("onnxruntime")
     from magtwin.learn.inference.onnx import export_onnx

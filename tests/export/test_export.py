@@ -21,8 +21,7 @@ from validators import assert_valid
 
 from magtwin.author.scene import author_scene
 from magtwin.author.scene_file import scene_from_toml
-from magtwin.export.package import PLUGIN, README, export_scene, licence_of
-from magtwin.export.usdz import ALIGNMENT, ALLOWED
+from magtwin.export.package import PLUGIN, README, export_scene
 from magtwin.export.validation.validate import validate
 from magtwin.field.survey.nodes import read_survey
 from magtwin.files.file import sha256, shipped
@@ -177,27 +176,6 @@ def test_an_export_names_nothing_by_an_absolute_path_and_nothing_outside(folder,
         assert all(file.is_relative_to(root.parent) for file in files)
 
 
-def test_an_exported_folder_is_the_scene_that_it_was_made_from(folder):
-    there, here = read_scene(LAB), read_scene(folder / "lab.usda")
-    assert here.robot.magnetometer.network == (folder / "weights" / WEIGHTS.name).resolve()
-    assert sha256(here.map_layer) == sha256(there.map_layer) == here.map_sha256
-    own = replace(here.robot.magnetometer, network=there.robot.magnetometer.network)
-    robot = replace(here.robot, asset=there.robot.asset, magnetometer=own)
-    assert replace(here, map_layer=there.map_layer, robot=robot) == there
-
-
-def test_every_entry_of_a_package_is_of_a_kind_that_it_may_hold_and_begins_at_64_bytes(package):
-    archive = Sdf.ZipFile.Open(str(package))
-    names = archive.GetFileNames()
-    assert names[0] == "lab_run.usdc"
-    for name in names:
-        about = archive.GetFileInfo(name)
-        assert Path(name).suffix in ALLOWED
-        assert about.dataOffset % ALIGNMENT == 0
-        assert about.compressionMethod == 0
-        assert not about.encrypted
-
-
 def test_a_package_names_no_network_which_lies_beside_it_with_its_onnx(package, played, tmp_path):
     beside = package.with_name("lab_magtwin")
     assert (beside / "weights" / WEIGHTS.name).read_bytes() == WEIGHTS.read_bytes()
@@ -303,15 +281,6 @@ def test_a_stage_for_viewers_is_one_layer_without_instances_or_variants_that_sho
     assert_allclose(end, played["p_world_base"][-1], atol=1e-9)
 
 
-def test_a_single_layer_names_no_file(tmp_path):
-    export_scene(LAB, tmp_path / "lab.usd", trusted=True)
-    stage = Usd.Stage.Open(str(tmp_path / "lab.usd"))
-    assert len([layer for layer in stage.GetUsedLayers() if not layer.anonymous]) == 1
-    assert not any(named_in(tmp_path / "lab.usd"))
-    (check,) = validate(tmp_path / "lab.usd", ["magtwin"]).checks
-    assert [(f.rule, f.severity) for f in check.findings] == [("network-file", "note")]
-
-
 def test_the_same_inputs_make_the_same_bytes(folder, package, web, played, tmp_path):
     def digest(place: Path) -> dict[str, str]:
         files = [place] if place.is_file() else sorted(f for f in place.rglob("*") if f.is_file())
@@ -333,23 +302,6 @@ def test_metadata_and_page_say_what_an_export_was_made_from_and_under_which_lice
     page = (folder / README).read_text()
     for word in ("`lab_run.usdc` plays a run", "PXR_PLUGINPATH_NAME", said["sourceSha256"], WEIGHTS.name):
         assert word in page
-
-
-@pytest.mark.parametrize(("metadata", "said"), [({"licence": "MIT"}, "MIT"), ({}, ""), (None, "")])
-def test_the_licence_of_a_network_is_read_from_its_weights(metadata, said, tmp_path):
-    header = {} if metadata is None else {"__metadata__": {"magtwin": json.dumps({"facts": metadata})}}
-    text = json.dumps(header).encode()
-    (tmp_path / "net.safetensors").write_bytes(struct.pack("<Q", len(text)) + text)
-    assert licence_of(tmp_path / "net.safetensors") == said
-
-
-def test_for_newton_the_export_has_a_script_that_reads_its_network(tmp_path):
-    out = tmp_path / "lab"
-    export_scene(LAB, out, profile="newton", to_onnx=write_words, trusted=True)
-    assert (out / "newton_magnetometer.py").is_file()
-    assert (out / "weights" / f"{WEIGHTS.stem}.onnx").is_file()
-    call = f"newton_magnetometer.py lab.usda weights/{WEIGHTS.stem}.onnx"
-    assert call in (out / README).read_text()
 
 
 # glTF
@@ -403,21 +355,6 @@ def shape_area(shape) -> float:
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
 
-def test_the_floor_of_a_glb_has_the_colours_of_the_heat_map(web):
-    said, data = contents(web)
-    mesh = said["meshes"][next(n["mesh"] for n in said["nodes"] if n["name"] == "AnomalyMap")]
-    (primitive,) = mesh["primitives"]
-    rows = {name: array_of(said, data, index) for name, index in primitive["attributes"].items()}
-    (heat_map,) = (s for s in read_shapes(Usd.Stage.Open(str(LAB))) if s.prim == HEAT_MAP)
-    colour_at = {
-        tuple(np.round(p, 5)): c for p, c in zip(heat_map.vertices, heat_map.vertex_colours, strict=True)
-    }
-    assert len(rows["POSITION"]) == len(colour_at)
-    for point, colour in zip(rows["POSITION"], rows["COLOR_0"], strict=True):
-        assert_allclose(colour, colour_at[tuple(np.round(point, 5))], atol=1e-6)
-    assert "KHR_materials_unlit" in said["materials"][primitive["material"]]["extensions"]
-
-
 def array_of(said: dict, data: bytes, index: int) -> np.ndarray:
     accessor = said["accessors"][index]
     view = said["bufferViews"][accessor["bufferView"]]
@@ -425,18 +362,6 @@ def array_of(said: dict, data: bytes, index: int) -> np.ndarray:
     width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
     values = np.frombuffer(data, kind, accessor["count"] * width, view["byteOffset"])
     return values.reshape(-1, width) if width > 1 else values
-
-
-def test_a_glb_tells_of_map_and_magnetometer(web):
-    said, data = contents(web)
-    extras = {node["name"]: node["extras"] for node in said["nodes"] if "extras" in node}
-    assert extras["magnetometer"]["magtwin:magnetometer:kind"] == "neural"
-    told, field = extras["AnomalyMap"], load_map(LAB)
-    assert_allclose(told["magtwin:anomalyMap:headingsDeg"], np.degrees(field.headings_rad), atol=1e-9)
-    values = array_of(said, data, told["magtwin:anomalyMap:valuesNt"]["accessor"])
-    assert_allclose(values, field.values_nt.astype(np.float32).ravel(), atol=0)
-    assert told["colours"]["unit"] == "nT"
-    assert said["asset"]["extras"]["profile"] == "viewer"
 
 
 def test_a_run_moves_the_nodes_of_a_glb(web, played):
@@ -478,10 +403,7 @@ def aprilab(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return author_scene(scene, home / "aprilab")
 
 
-@pytest.mark.parametrize(
-    ("out", "profile"),
-    [("a.usdz", "isaac"), ("a", "viewer"), ("a.glb", "viewer")],
-)
+@pytest.mark.parametrize(("out", "profile"), [("a.usdz", "isaac"), ("a", "viewer"), ("a.glb", "viewer")])
 def test_the_aprilab_lab_exports_for_every_profile_with_the_licence_of_its_map(
     aprilab, out, profile, tmp_path
 ):

@@ -1,6 +1,5 @@
 """Exports of what others made: refused with what to do and nothing written, or converted point by point."""
 
-import json
 import shutil
 import signal
 import struct
@@ -8,19 +7,15 @@ import subprocess
 import zipfile
 from pathlib import Path
 
-import numpy as np
 import pytest
-from pxr import Sdf, Usd
+from pxr import Sdf
 
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.export.package import export_scene
-from magtwin.export.structure import structure
 from magtwin.export.usdz import pack, unpack
 from magtwin.files.file import sha256, shipped
 from magtwin.files.folders import allow
-from magtwin.io.tables import write_parquet
-from magtwin.run.run import Run
 
 LAB = shipped("scenes", "lab", "lab.usda")
 HEAD = '#usda 1.0\n(\n    defaultPrim = "World"\n    metersPerUnit = 1\n    upAxis = "Z"\n)\n'
@@ -239,22 +234,7 @@ def test_an_export_does_not_take_the_place_of_the_stage_that_it_is_made_from(lab
     assert (own / "room.usda").is_file()
 
 
-def test_a_robot_alone_can_be_handed_on(tmp_path):
-    robot = shipped("robots", "turtlebot4", "turtlebot4.usda")
-    made = export_scene(robot, tmp_path / "robot.usdz", trusted=True)
-    assert Usd.Stage.Open(str(made.root)).GetPrimAtPath("/turtlebot4/left_wheel")
-    assert made.licences == {"turtlebot4.usda": "Apache-2.0"}
-
-
 # Structure
-
-
-def test_a_robot_that_is_laid_out_already_stays_as_it_is(tmp_path):
-    export_scene(LAB, tmp_path / "lab", profile="isaac", trusted=True)
-    asset = tmp_path / "lab" / "turtlebot4" / "turtlebot4.usda"
-    before = {f: f.read_bytes() for f in asset.parent.rglob("*") if f.is_file()}
-    structure(asset)
-    assert {f: f.read_bytes() for f in asset.parent.rglob("*") if f.is_file()} == before
 
 
 # The command
@@ -265,30 +245,6 @@ def test_the_command_exports_a_scene_by_its_name_and_says_what_it_made_as_json(t
     said = capsys.readouterr().out
     assert '"profile"' in said
     assert struct.unpack("<4s", (tmp_path / "lab.glb").read_bytes()[:4]) == (b"glTF",)
-
-
-def test_the_command_draws_a_thumbnail_and_plays_a_run(tmp_path, capsys):
-    out, run = tmp_path / "lab", tmp_path / "run.parquet"
-    poses = {"p_world_base": np.zeros((2, 3)), "q_world_base_xyzw": np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))}
-    write_parquet(Run({"t": np.array([0.0, 1.0]), **poses}), run)
-    main(["export", str(LAB), "--out", str(out), "--run", str(run), "--no-onnx"])
-    picture = (out / ".thumbs" / "256x256" / "lab.usda.png").read_bytes()
-    assert struct.unpack_from(">II", picture, 16) == (256, 256)
-    assert (out / "lab_run.usdc").is_file()
-    assert "Wrote" in capsys.readouterr().out
-
-
-def test_a_stage_that_shows_nothing_is_exported_without_a_thumbnail_and_says_so(tmp_path, capsys):
-    stage, out = tmp_path / "bare.usda", tmp_path / "out"
-    stage.write_text(
-        '#usda 1.0\n(\n    defaultPrim = "A"\n    metersPerUnit = 1\n    upAxis = "Z"\n)\n'
-        'def Xform "A"\n{\n}\n'
-    )
-    main(["export", str(stage), "--out", str(out), "--json"])
-    (note,) = json.loads(capsys.readouterr().out)["metadata"]["notes"]
-    assert note.startswith("no thumbnail was drawn: bare.usda: shows nothing")
-    assert (out / "bare.usda").is_file()
-    assert not (out / ".thumbs").exists()
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,12 @@
 from dataclasses import replace
 
 import pytest
-from pxr import Sdf, Usd, UsdPhysics
+from pxr import Usd, UsdPhysics
 
 from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
 from magtwin.export.isaac import GRAPHS, author_graph
-from magtwin.export.ogn import Graph, message_fields, node_types
+from magtwin.export.ogn import message_fields, node_types
 from magtwin.io.bags.sender import sender_of
 from magtwin.io.bags.topics import SCAN, TOPICS
 from magtwin.io.bags.types import layout
@@ -18,11 +18,7 @@ from magtwin.usd.layers import open_stage
 from magtwin.usd.scene import read_scene
 from magtwin.usd.schema import only_prim_with
 
-USD_TYPES = {
-    "execution": "uint",
-    "vectord[3]": "vector3d",
-    "quatd[4]": "quatd",
-}
+USD_TYPES = {"execution": "uint", "vectord[3]": "vector3d", "quatd[4]": "quatd"}
 """OmniGraph's types that USD calls otherwise."""
 
 ROLES = {"vectord[3]": "double[3]", "quatd[4]": "double[4]"}
@@ -162,21 +158,6 @@ def test_fields_of_messages_are_the_leaves_that_magtwin_itself_writes(message):
     assert message_fields(message) == want
 
 
-def test_pose_and_battery_are_put_together_as_the_robot_has_them(authored):
-    _, scene, graph = authored
-    pose, battery = graph.GetChild("publish_pose"), graph.GetChild("publish_battery")
-    for group, parts in (("position", "xyz"), ("orientation", "xyzw")):
-        for axis in parts:
-            (path,) = pose.GetAttribute(f"inputs:pose:{group}:{axis}").GetConnections()
-            assert path.name == f"outputs:{axis}"
-    pack = scene.robot.battery
-    volts, amperes = (battery.GetAttribute(f"inputs:{name}").Get() for name in ("voltage", "current"))
-    assert volts * -amperes == pytest.approx(pack.load_w, rel=1e-5)
-    assert pack.voltage_empty_v < volts < pack.voltage_full_v
-    assert battery.GetAttribute("inputs:percentage").Get() == pack.initial_fraction
-    assert graph.GetChild("seldom").GetAttribute("inputs:step").Get() == 60 / pack.rate_hz
-
-
 def test_frames_of_messages_are_those_that_a_bag_of_the_robot_names(authored):
     _, scene, graph = authored
     who = sender_of(scene.robot)
@@ -246,10 +227,3 @@ def test_what_is_no_robot_to_isaac_is_refused_with_what_to_do(lab_scene):
     with pytest.raises(InputError, match="robotLinks lists none"):
         author_graph(stage, scene)
     assert not stage.GetPrimAtPath(GRAPHS)
-
-
-def test_a_graph_takes_no_path_of_another_prim():
-    stage = Usd.Stage.CreateInMemory()
-    stage.DefinePrim("/Graph", "Xform")
-    with pytest.raises(InputError, match="is a Xform already"):
-        Graph(stage, Sdf.Path("/Graph"))

@@ -32,38 +32,6 @@ FOUND = {
 }
 """A prim of `ROBOT` at which each rule finds an error."""
 
-OWN_RULES = """
-import carb
-import omni.nothing.known
-import omni.client
-from omni.asset_validator.core import BaseRuleChecker, registerRule
-from pxr import PhysxSchema
-
-@registerRule("Ours")
-class Names(BaseRuleChecker):
-    def CheckPrim(self, prim):
-        if prim.HasAPI(PhysxSchema.PhysxArticulationAPI):
-            self._AddWarning(message="an articulation", at=prim)
-
-@registerRule("Ours")
-class Breaks(BaseRuleChecker):
-    def CheckStage(self, stage):
-        stage.GetSessionLayer().Clear()
-        raise KeyError("broken")
-
-@registerRule("IsaacSim.RobotRules")
-class Steps(BaseRuleChecker):
-    def CheckStage(self, stage):
-        omni.nothing.known.simulate(carb.settings)
-
-@registerRule("IsaacSim.RobotRules")
-class Lists(BaseRuleChecker):
-    def CheckStage(self, stage):
-        result, entries = omni.client.list(stage.GetRootLayer().realPath + "/..")
-        if result != omni.client.Result.OK:
-            self._AddInfo(message="no folder")
-"""
-
 
 @pytest.fixture
 def robot(tmp_path):
@@ -99,17 +67,6 @@ def test_isaac_sims_rules_find_each_fault_of_a_robot_with_many(isaac_rules, robo
         *("InvisibleCollisionMeshHasPurposeGuide", "JointsExist", "LinksExist", "NoNestedMaterials"),
         "ThumbnailExists",
     }
-
-
-def test_a_robots_findings_name_its_prim_on_the_stage_and_come_once(isaac_rules, robot):
-    stage = robot.with_name("stage.usda")
-    stage.write_text('#usda 1.0\n(defaultPrim = "World")\ndef "World" {\n'
-                     'def "ann" (references = @./bot.usda@) {}\n}\n')  # fmt: skip
-    check = isaac(stage, {"/World/ann": robot})
-    rules = [(rule, where) for rule, where, _ in errors(check)]
-    assert rules.count(("RigidBodyHasCollider", "/World/ann/b")) == 1
-    assert ("RobotNaming", "/World/ann") in rules
-    assert {where.startswith("/World/ann") for _, where in rules} == {True}
 
 
 def test_rules_that_cannot_run_are_named_with_the_reason_and_are_not_counted(isaac_rules, lab_scene):
@@ -154,21 +111,6 @@ def test_the_makers_description_of_the_turtlebot_4_converts_without_an_error(
     check = isaac(asset, {"/turtlebot4": asset})
     assert errors(check) == []
     assert check.scope.startswith("23 of 24 rules")
-
-
-def test_a_rule_sees_schemas_without_plugins_and_one_that_fails_or_needs_kit_ends_nothing(own_rules, robot):
-    own_rules(OWN_RULES)
-    robot.write_text(ROBOT.replace('"IsaacRobotAPI",', '"IsaacRobotAPI", "PhysxArticulationAPI",'))
-    check = isaac(robot, {"/bot": robot})
-    assert [(f.rule, f.where, f.severity) for f in check.findings] == [
-        ("Breaks", "/bot", "error"),
-        ("Lists", "/bot", "note"),
-        ("Names", "/bot", "warning"),
-        ("not-run", "", "note"),
-    ]
-    assert check.findings[0].text == "the rule failed: KeyError: 'broken'"
-    assert check.findings[-1].text == "Steps: needs Isaac Sim itself (omni.nothing.known.simulate)"
-    assert check.scope == "3 of 4 rules of isaacsim.asset.validation 1.3.6"
 
 
 def test_a_finding_in_a_variant_that_is_not_chosen_names_its_prim(own_rules, tmp_path):

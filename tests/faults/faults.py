@@ -328,21 +328,9 @@ def preload() -> None:
 ARROW = "jemalloc_bg_thd"
 """A thread of Arrow, which starts it again after a fork."""
 
-PRELOADED = (
-    "numpy",
-    "scipy.spatial",
-    "scipy.sparse.linalg",
-    "scipy.optimize",
-    "numba",
-    "pyarrow.parquet",
-    "pxr.Usd",
-    "pxr.UsdGeom",
-    "pxr.UsdPhysics",
-    "pxr.UsdShade",
-    "pxr.UsdUtils",
-    "matplotlib.pyplot",
-    "torch",
-)
+PRELOADED = ("numpy", "scipy.spatial", "scipy.sparse.linalg", "scipy.optimize", "numba", "pyarrow.parquet")
+PRELOADED += ("pxr.Usd", "pxr.UsdGeom", "pxr.UsdPhysics", "pxr.UsdShade", "pxr.UsdUtils", "matplotlib.pyplot")
+PRELOADED += ("torch",)
 """OpenUSD's plugins and Rerun start threads when they are loaded, so each fork loads them."""
 
 

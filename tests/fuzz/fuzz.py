@@ -51,37 +51,10 @@ KEPT, LARGEST = 100, 1 << 18
 CORPUS = Path(__file__).with_name("corpus")
 """Inputs that were faults once: FORMAT/NAME."""
 
-NUMBERS = (
-    "0",
-    "-1",
-    "nan",
-    "1e-320",
-    "1e400",
-    "-0.0",
-    "0x10",
-    str(1 << 31),
-    str(1 << 64),
-    "9" * 23,
-    "1" * 5000,
-)
-WORDS = (
-    "",
-    "\x00",
-    "é",
-    "../../x",
-    "/dev/null",
-    "a" * 300,
-    "{",
-    "}",
-    "[[",
-    "]]",
-    "<",
-    ">",
-    '"',
-    "'",
-    "@",
-    "\x1b[2J",
-)
+NUMBERS = ("0", "-1", "nan", "1e-320", "1e400", "-0.0", "0x10")
+NUMBERS += (str(1 << 31), str(1 << 64), "9" * 23, "1" * 5000)
+WORDS = ("", "\x00", "é", "../../x", "/dev/null", "a" * 300)
+WORDS += ("{", "}", "[[", "]]", "<", ">", '"', "'", "@", "\x1b[2J")
 WORDS += ("null", "None", "true", "[]", "{}", '""', "*a", "&a", "<<", "${x}", "#", "\\", "\u202e", "inf")
 ENCODED = (*(word.encode() for word in WORDS), b"\xed\x9f\xbf", b"\xff\xfe", b"\xed\xa0\x80", b"\xef\xbb\xbf")
 FLOATS = (0.0, -1.0, 1e9, -1e300, 1e300, 5e-324, math.nan, math.inf)
@@ -123,6 +96,10 @@ USD_ATTRIBUTE = re.compile(
 """An attribute or relationship of one line in USD's text."""
 
 WHOLE = (0, 1, 0x7F, 0xFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF, 1 << 40, (1 << 63) - 1, (1 << 64) - 1)
+
+
+IMPORTED = ("magtwin", "numpy", "scipy", "pxr", "pyarrow", "trimesh", "torch", "yaml")
+"""What readers import, so that each child need not."""
 
 
 class HangError(BaseException):
@@ -387,16 +364,7 @@ class Fuzzer:
 
         self.seeds[kind], modules = in_child(written)
         for name in modules:  # now, and not in each child
-            if name.partition(".")[0] in (
-                "magtwin",
-                "numpy",
-                "scipy",
-                "pxr",
-                "pyarrow",
-                "trimesh",
-                "torch",
-                "yaml",
-            ):
+            if name.partition(".")[0] in IMPORTED:
                 with contextlib.suppress(Exception):
                     importlib.import_module(name)
         whole = self.seeds[kind]

@@ -22,18 +22,9 @@ import numpy as np
 TEXTS = Path(__file__).with_name("texts")
 """Files of text that seeds begin from."""
 
+NAMES = ("x.xacro", "cart.urdf", "controllers.yaml", "robot.toml", "room.toml", "suite.toml", "stage.usda")
 XACRO, URDF, CONTROLLERS, ROBOT, SCENE, SUITE, STAGE, OBJ = (
-    (TEXTS / name).read_text(encoding="utf-8")
-    for name in (
-        "x.xacro",
-        "cart.urdf",
-        "controllers.yaml",
-        "robot.toml",
-        "room.toml",
-        "suite.toml",
-        "stage.usda",
-        "m.obj",
-    )
+    (TEXTS / name).read_text(encoding="utf-8") for name in (*NAMES, "m.obj")
 )
 MTL = "newmtl red\nKd 1 0 0\nd 0.5\nmap_Kd t.png\n"
 

@@ -74,14 +74,7 @@ def test_every_kind_of_file_that_is_read_is_fuzzed():
     from magtwin.urdf.meshes.mesh import READERS
 
     written = {
-        ".py",
-        ".html",
-        ".md",
-        ".svg",
-        ".mp4",
-        ".pt",
-        ".jpeg",
-        ".usd",
+        *(".py", ".html", ".md", ".svg", ".mp4", ".pt", ".jpeg", ".usd"),
         *(".bag", ".sdf", ".world", ".pgm", ".yml"),
         *(".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".7z", ".rar"),
     }  # never read, or by another name

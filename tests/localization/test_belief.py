@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.localization.belief import mean_variance, table_of, tempering
+from magtwin.localization.belief import table_of, tempering
 
 
 def belief(node_sd_nt, between_sd_nt):
@@ -27,12 +27,3 @@ def belief(node_sd_nt, between_sd_nt):
 )
 def test_random_errors_temper_by_their_size(node_sd_nt, kappa):
     assert tempering(belief(node_sd_nt, None), 20.0) == pytest.approx(kappa)
-
-
-def test_errors_of_interpolation_temper_more_up_to_3():
-    table = belief(0.0, 100.0)
-    rms = np.sqrt(mean_variance(table).mean())
-    assert tempering(table, 20.0) == pytest.approx(1 + rms / 100)
-    assert tempering(table, 20.0) > tempering(belief(float(rms), None), 20.0)
-    assert tempering(belief(0.0, 300.0), 20.0) == 3.0
-    assert tempering(belief(700.0, 400.0), 20.0) == 4.0

@@ -7,12 +7,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-import magtwin.localization.bounds as module
 from magtwin.errors import InputError
 from magtwin.localization.bounds import bounds
 from magtwin.localization.problem import Prior, Problem, SensorModel
-
-NAMES = ("dead_reckoning", "exact", "white", "correlated", "oracle", "smoothed")
 
 
 class Waves:
@@ -152,29 +149,6 @@ def test_correlated_and_smoothed_bounds_are_those_of_the_joint_gaussian_of_the_p
     assert_allclose(made.correlated, root(np.array(causal)), rtol=1e-6)
     assert_allclose(made.heading, np.sqrt(np.array(causal)[:, 2, 2]), rtol=1e-6)
     assert_allclose(made.smoothed, root(np.array(smoothed)), rtol=1e-6)
-
-
-def test_the_bounds_are_ordered():
-    pose, t = path(400, turn=0.02)
-    made = bounds(problem(), pose, t)
-    tiny = 1 + 1e-7
-    assert np.all(made.oracle <= made.exact * tiny)
-    assert np.all(made.exact <= made.white * tiny)
-    assert np.all(made.white <= made.dead_reckoning * tiny)
-    assert np.all(made.smoothed <= made.correlated * tiny)
-    assert made.rms("correlated") > 1.05 * made.rms("white")
-    last = made.smoothed[-1]
-    assert_allclose(last, made.correlated[-1], rtol=1e-6)
-
-
-def test_parts_of_a_long_run_lose_only_drift_and_map_error(monkeypatch):
-    pose, t = path()
-    plain = problem(sensor=SensorModel(lever_arm_m=(-0.1, 0.05), iron_nt=400, drift_nt=0))
-    whole = bounds(plain, pose, t, map_error_nt=0.0)
-    monkeypatch.setattr(module, "MOST", 35)
-    parts = bounds(plain, pose, t, map_error_nt=0.0)
-    for name in ("dead_reckoning", "exact", "white", "correlated", "oracle"):
-        assert_allclose(getattr(parts, name), getattr(whole, name), rtol=1e-6, err_msg=name)
 
 
 def test_readings_that_are_not_used_carry_no_information():

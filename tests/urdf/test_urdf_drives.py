@@ -84,15 +84,8 @@ def test_joints_without_limits_hold_a_position_where_they_bear_a_load(tmp_path):
     assert drive_of(robot, "yaw")[1] >= 100  # that of an arm, such as Jaco's
 
 
-def test_a_wheel_by_name_rolls_although_its_centre_of_mass_is_beside_its_axis(tmp_path):
-    path = urdf(tmp_path, LEG.replace('"shank"', '"left_wheel"'), "leg")
-    _stage, robot, _ = converted(path)
-    assert drive_of(robot, "knee")[1] == 0
-
-
 @pytest.mark.parametrize(
-    ("interfaces", "held"),
-    [(("velocity", "position"), True), (("effort",), True), (("velocity",), False)],
+    ("interfaces", "held"), [(("velocity", "position"), True), (("effort",), True), (("velocity",), False)]
 )
 def test_a_joint_with_limits_is_held_unless_it_takes_velocities_only(tmp_path, interfaces, held):
     """xArm and TIAGo take both: their arms sank by 7 and 36 mm/s. Those of Panda and PR2, by effort, fell."""

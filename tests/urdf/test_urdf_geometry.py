@@ -1,6 +1,5 @@
 """Meshes, materials and colliders of a URDF: each format and feature from a tiny file made here."""
 
-import io
 import json
 import re
 import struct
@@ -163,15 +162,6 @@ def test_a_texture_is_copied_beside_the_asset_and_keeps_its_place_on_the_mesh(tm
     assert_valid(stage.GetRootLayer().realPath, tmp_path)
 
 
-def test_a_bitmap_becomes_png_with_a_note(tmp_path):
-    Image.new("RGB", (2, 2), (10, 20, 30)).save(tmp_path / "t.bmp")
-    stage = robot(tmp_path, visual(squares(tmp_path, "newmtl red\nmap_Kd t.bmp\nnewmtl blue\n")))
-    with Image.open(tmp_path / "out/payloads/textures/t.png") as image:
-        assert image.getpixel((0, 0))[:3] == (10, 20, 30)
-    note = "squares.obj: texture 't.bmp' is BMP, which not every USD viewer reads; written as PNG"
-    assert note in notes_of(stage)
-
-
 LOST = {
     "missing": ("map_Kd no.png", "squares.obj: texture 'no.png' is missing and is left out; looked for"),
     "outside": ("map_Kd ../up.png", "texture '../up.png' lies outside the robot's packages and is left out"),
@@ -280,45 +270,6 @@ def test_inches_become_metres_and_an_up_axis_is_left_alone_as_in_rviz(tmp_path):
     assert note in notes_of(stage)
 
 
-SAMPLER = """<newparam sid="f"><surface type="2D"><init_from>i</init_from></surface></newparam>
-<newparam sid="w"><sampler2D><source>f</source></sampler2D></newparam>"""
-
-
-def test_a_collada_texture_arrives_even_under_a_percent_encoded_name(tmp_path):
-    picture(tmp_path / "my skin.png")
-    dae(
-        tmp_path / "n.dae",
-        "<node>{mesh}</node>",
-        images='<image id="i"><init_from>my%20skin.png</init_from></image>',
-        extra=SAMPLER,
-        diffuse='<texture texture="w" texcoord="UV"/>',
-    )
-    stage = robot(tmp_path, visual("n.dae"))
-    (mesh,) = meshes_of(stage)
-    assert surface_of(mesh).GetInput("diffuseColor").HasConnectedSource()
-    assert (tmp_path / "out/payloads/textures/my_skin.png").is_file()
-    assert len(corners_of(mesh, "st")[0]) == 4
-    assert not [note for note in notes_of(stage) if "n.dae" in note]
-    (tmp_path / "my skin.png").unlink()
-    stage = robot(tmp_path, visual("n.dae"))
-    assert any("texture 'my%20skin.png' is missing" in note for note in notes_of(stage))
-    assert_allclose(read_shapes(stage)[0].colour[:3], linear_from_srgb([0.5] * 3), atol=1e-4)
-
-
-def test_a_geometry_stays_although_its_material_or_texture_cannot_be_read(tmp_path):
-    dae(tmp_path / "n.dae", "<node>{mesh}</node>", diffuse='<texture texture="nowhere" texcoord="UV"/>')
-    stage = robot(tmp_path, visual("n.dae"))
-    assert "n.dae: texture 'nowhere' names no image and is left out" in notes_of(stage)
-    assert len(read_shapes(stage)[0].faces) == 4
-    path = tmp_path / "n.dae"
-    path.write_text(path.read_text().replace('url="#e"', 'url="#gone"'))
-    stage = robot(tmp_path, visual("n.dae", GREEN))
-    assert "n.dae: material 'skin' has no effect that can be read; shown without it" in notes_of(stage)
-    assert_allclose(read_shapes(stage)[0].colour, [0, 1, 0, 1], atol=1e-5)
-    with pytest.raises(InputError, match="has no effect that can be read"):
-        robot(tmp_path, visual("n.dae"), options=Options(strict=True))
-
-
 def test_collada_nodes_may_refer_to_others_but_not_to_themselves(tmp_path):
     path = dae(tmp_path / "n.dae", '<node><translate>0 0 1</translate><instance_node url="#part"/></node>')
     shape = '<instance_geometry url="#g"/>'
@@ -329,24 +280,6 @@ def test_collada_nodes_may_refer_to_others_but_not_to_themselves(tmp_path):
     path.write_text(text.replace("<library_images>", library.format('<instance_node url="#part"/>')))
     with pytest.raises(InputError, match=r"n\.dae:\d+: node 'part' is within itself; export it again"):
         read_mesh(path)
-
-
-@pytest.mark.parametrize(
-    ("colour", "read"),
-    [("0.5 0.0 0.01.0", (0.5, 0, 0, 1)), ("0.2 0.4 0.6", (0.2, 0.4, 0.6, 1)), ("red", (0.5, 0.5, 0.5, 1))],
-)
-def test_a_malformed_collada_colour_is_repaired_with_a_note(tmp_path, colour, read):
-    mesh = read_mesh(dae(tmp_path / "n.dae", "<node>{mesh}</node>", diffuse=f"<color>{colour}</color>"))
-    assert_allclose(mesh.paints[0].rgba, read)
-    words = " ".join(f"{c:g}" for c in read)
-    assert [text for text, _ in mesh.notes] == [f"n.dae: malformed colour {colour!r} read as {words!r}"]
-
-
-def test_a_collada_file_whose_author_has_an_accent_in_latin_1_is_read(tmp_path):
-    path = dae(tmp_path / "n.dae", "<node>{mesh}</node>")
-    text = path.read_text().replace("<asset>", "<asset><contributor><author>José</author></contributor>")
-    path.write_bytes(text.encode("latin-1"))
-    assert len(read_mesh(path).faces) == 4
 
 
 PRIMITIVES = {
@@ -588,41 +521,6 @@ def test_gltf_nodes_are_where_trimesh_has_them_turned_to_z_up(tmp_path, binary):
     assert_allclose(bounds(seen.vertices), bounds(np.column_stack([x, -z, y])), atol=1e-5)
 
 
-def test_gltf_colours_are_linear_and_its_picture_is_kept_byte_by_byte(tmp_path):
-    data = io.BytesIO()
-    Image.new("RGBA", (1, 1), (255, 255, 255, 128)).save(data, "PNG")
-    surface = {
-        "baseColorFactor": [0.25, 0.5, 1, 0.5],
-        "baseColorTexture": {"index": 0},
-        "metallicFactor": 0.75,
-        "roughnessFactor": 0.125,
-    }
-    material = {"name": "skin", "alphaMode": "BLEND", "doubleSided": True, "pbrMetallicRoughness": surface}
-    gltf(tmp_path / "t.glb", material=material, pictures=[data.getvalue()])
-    stage = robot(tmp_path, visual("t.glb"))
-    (mesh,) = meshes_of(stage)
-    look = surface_of(mesh)
-    assert_allclose([look.GetInput(n).Get() for n in ("metallic", "roughness")], [0.75, 0.125])
-    texture = UsdShade.Shader(look.GetInput("diffuseColor").GetConnectedSources()[0][0].source)
-    assert_allclose(texture.GetInput("scale").Get(), [0.25, 0.5, 1, 0.5], atol=1e-5)
-    assert look.GetInput("opacity").GetConnectedSources()[0][0].sourceName == "a"
-    assert (tmp_path / "out/payloads/textures/skin.png").read_bytes() == data.getvalue()
-    uvs, corners = corners_of(mesh, "st")
-    assert_allclose(uvs[np.all(np.isclose(corners, 0), axis=-1)], [[0, 1]] * 3)  # glTF counts v downwards
-    assert mesh.GetDoubleSidedAttr().Get()
-    assert_valid(stage.GetRootLayer().realPath, tmp_path)
-
-
-def test_gltf_vertex_colours_multiply_the_factor(tmp_path):
-    material = {"pbrMetallicRoughness": {"baseColorFactor": [0.5, 1, 1, 1]}}
-    gltf(tmp_path / "t.glb", material=material, colours=[[255, 0, 0, 255], [0, 255, 0, 255]] * 2)
-    stage = robot(tmp_path, visual("t.glb"))
-    (seen,) = read_shapes(stage)
-    assert_allclose(seen.vertex_colours[np.isclose(seen.vertices[:, 0], 1)], [[0, 1, 0]] * 3, atol=1e-4)
-    assert_allclose(seen.vertex_colours[np.isclose(seen.vertices[:, 1], -3)], [[0, 1, 0]] * 3, atol=1e-4)
-    assert_allclose(seen.vertex_colours[np.isclose(seen.vertices[:, 2], 2)], [[0.5, 0, 0]] * 3, atol=1e-4)
-
-
 @pytest.mark.parametrize(("mode", "index"), [(5, [0, 2, 1, 3]), (6, [0, 2, 1, 3])])
 def test_gltf_strips_and_fans_are_cut_as_the_specification_says(tmp_path, mode, index):
     mesh = read_mesh(gltf(tmp_path / "t.glb", mode=mode, index=index))
@@ -664,17 +562,6 @@ def test_a_scaled_or_mirrored_mesh_keeps_its_pictures_and_colours_and_faces_outw
         assert_allclose(uvs[np.all(np.isclose(corners, point), axis=-1)], np.tile(uv, (3, 1)), atol=1e-6)
     red = mesh.GetPrim().GetChild("red")
     assert list(UsdGeom.Subset(red).GetIndicesAttr().Get()) == [0, 1]
-
-
-def test_normals_of_a_file_are_kept_and_turn_by_the_inverse_transpose(tmp_path):
-    root = np.sqrt(0.5)  # a slope of 45 degrees
-    (tmp_path / "t.obj").write_text(
-        f"v 0 0 0\nv 1 0 1\nv 1 1 1\nv 0 1 0\nvn {-root} 0 {root}\nf 1//1 2//1 3//1 4//1\n"
-    )
-    stage = robot(tmp_path, visual("t.obj", scale="2 1 1"))
-    (mesh,) = meshes_of(stage)
-    normals, _ = corners_of(mesh, "normals")
-    assert_allclose(normals, np.broadcast_to(np.array([-1, 0, 2]) / np.sqrt(5), (2, 3, 3)), atol=1e-4)
 
 
 def test_visuals_of_one_mesh_share_its_arrays_and_none_is_an_instance(tmp_path):
@@ -735,17 +622,6 @@ def test_a_urdf_material_applies_to_parts_without_a_material(tmp_path):
     assert_allclose(colours, [[0, 1, 0]] * 2 + [[0, 0, 0.21404]] * 2, atol=1e-5)
 
 
-@pytest.mark.parametrize("head", [GREEN, ""])
-def test_a_material_of_the_robot_or_of_one_visual_applies_to_others_that_name_it(tmp_path, head):
-    trimesh.Trimesh(POINTS, FACES, process=False).export(tmp_path / "t.stl")
-    looks = ("" if head else GREEN, '<material name="green"/>', '<material name="geren"/>')
-    stage = robot(tmp_path, "".join(visual("t.stl", look) for look in looks), head=head)
-    colours = [shape.colour for shape in read_shapes(stage)]
-    assert_allclose(colours[1], [0, 1, 0, 1], atol=1e-5)
-    assert_allclose(colours[2][:3], np.full(3, colours[2][0]))
-    assert "material 'geren' is named, but has no colour: shown without it" in notes_of(stage)
-
-
 SKIN = '<material name="skin"><texture filename="{}"/></material>'
 
 
@@ -760,13 +636,6 @@ def test_a_urdf_texture_lies_on_a_mesh_with_coordinates_and_gives_others_its_mea
         surface_of(cube).GetInput("diffuseColor").Get(), linear_from_srgb([0.5, 0, 0.5]), atol=0.01
     )
     assert "material 'skin': a primitive shows the mean colour of its texture" in notes_of(stage)
-
-
-def test_a_urdf_texture_that_is_missing_is_noted_and_the_colour_stands_in(tmp_path):
-    skin = '<material name="skin"><color rgba="0 1 0 1"/><texture filename="no.png"/></material>'
-    stage = robot(tmp_path, f'<visual><geometry><box size="1 1 1"/></geometry>{skin}</visual>')
-    assert_allclose(read_shapes(stage)[0].colour, [0, 1, 0, 1], atol=1e-5)
-    assert any("texture 'no.png' of material 'skin' is missing" in note for note in notes_of(stage))
 
 
 # --- primitives and colliders ---------------------------------------------------------------------
@@ -872,14 +741,3 @@ def test_a_buffer_outside_the_package_is_refused(tmp_path):
     path.write_text(path.read_text().replace("shape.bin", "../shape.bin"))
     with pytest.raises(InputError, match=r"buffer '\.\./shape\.bin' lies outside the robot's packages; move"):
         robot(inside, visual("t.gltf"))
-
-
-def test_bytes_are_the_same_each_time(tmp_path):
-    picture(tmp_path / "tiles.png")
-    file = squares(tmp_path, MTL + "map_Kd tiles.png\n")
-    once = {}
-    for _ in range(2):
-        robot(tmp_path, visual(file) + collision(gltf(tmp_path / "t.glb").name))
-        files = {p.name: p.read_bytes() for p in sorted((tmp_path / "out").rglob("*")) if p.is_file()}
-        assert files == (once or files)
-        once = files

@@ -353,13 +353,6 @@ def test_a_file_that_cannot_be_looked_for_is_refused(tmp_path, name):
         convert_urdf(path, tmp_path / "arm.usda")
 
 
-def test_a_duplicate_package_is_noted(tmp_path):
-    path = robot(tmp_path)
-    package(tmp_path / "a", "hand"), package(tmp_path / "b", "hand")
-    description = read(path)
-    assert description.repairs.notes == ("package 'hand' exists 2 times; a is used",)
-
-
 def test_relative_paths_reach_to_the_package_and_no_further(tmp_path):
     path = robot(package(tmp_path / "arm", "arm") / "urdf")
     assert found(path, "../meshes/a.stl") == tmp_path / "arm" / "meshes" / "a.stl"

@@ -4,13 +4,13 @@ import numpy as np
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from scipy.spatial import ConvexHull
 
 from magtwin.urdf.meshes.collider import hull_faces
-from magtwin.urdf.meshes.mesh import _distinct_words, distinct
+from magtwin.urdf.meshes.mesh import distinct
 from magtwin.urdf.physics.inertia import is_closed
-from magtwin.usd.solids import CREASE, capsule, corner_normals
+from magtwin.usd.solids import capsule
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -25,19 +25,6 @@ def cloud(rng, kind):
     if kind == 3:
         points /= np.linalg.norm(points, axis=1, keepdims=True)
     return points
-
-
-@settings(max_examples=40, deadline=None)
-@given(seed=SEEDS, width=st.integers(1, 3))
-def test_rows_are_told_apart_with_and_without_keys(seed, width):
-    rows = np.random.default_rng(seed).choice(np.array([0.0, -0.0, 1.5, 2.0], np.float32), (60, width))
-    first, kind = distinct(rows)
-    assert_array_equal(rows[first][kind], rows)
-    assert len(first) == len(np.unique(rows + 0, axis=0))
-    assert (np.diff(first) > 0).all()
-    words = np.ascontiguousarray(rows + np.float32(0)).view(np.uint32)
-    for fast, slow in zip((first, kind), _distinct_words(words), strict=True):
-        assert_array_equal(fast, slow)
 
 
 @settings(max_examples=40, deadline=None)
@@ -61,28 +48,6 @@ def test_a_hull_is_scipys(seed, kind):
 
 def test_a_plane_has_no_hull():
     assert hull_faces(cloud(np.random.default_rng(0), 2)) is None
-
-
-@settings(max_examples=20, deadline=None)
-@given(seed=SEEDS, flat=st.booleans())
-def test_a_corners_normal_is_the_mean_of_the_faces_within_the_crease(seed, flat):
-    """The definition, face by face; `flat` has smooth points, else most have creases."""
-    rng = np.random.default_rng(seed)
-    x, y = np.meshgrid(np.arange(6.0), np.arange(6.0))
-    z = rng.normal(size=x.shape) * (0.05 if flat else 0.6)
-    points = np.column_stack([x.ravel(), y.ravel(), z.ravel()]).astype(np.float32)
-    i = np.arange(36).reshape(6, 6)
-    a, b, c, d = (k.ravel() for k in (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]))
-    faces = np.vstack([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
-    area = np.cross(*(points[faces[:, k]].astype(float) - points[faces[:, 0]] for k in (1, 2)))
-    unit = area / np.linalg.norm(area, axis=1, keepdims=True)
-    made = corner_normals(points, faces)
-    for face, corners in enumerate(faces):
-        for k, point in enumerate(corners):
-            around = np.flatnonzero((faces == point).any(axis=1))
-            near = around[unit[around] @ unit[face] >= np.cos(CREASE)]
-            mean = area[near].sum(axis=0)
-            assert_allclose(made[face, k], mean / np.linalg.norm(mean), atol=1e-5)
 
 
 @settings(max_examples=30, deadline=None)

@@ -106,25 +106,6 @@ def test_the_real_robots_layers_compose_to_its_single_file(name, request, tmp_pa
     assert_equal(composed(convert_urdf(urdf, tmp_path / "a.usda", options=options)), composed(out))
 
 
-def test_textures_come_along(tmp_path):
-    mesh = trimesh.creation.box()
-    picture = trimesh.visual.texture.SimpleMaterial(image=_picture())
-    mesh.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=picture)
-    mesh.export(tmp_path / "box.obj")
-    shape = '<visual><geometry><mesh filename="box.obj"/></geometry></visual>'
-    path = tmp_path / "arm.urdf"
-    path.write_text(f'<robot name="arm"><link name="base_link">{INERTIAL}{shape}</link></robot>')
-    one, two = both(path, tmp_path)
-    assert any("inputs:file" in metadata for metadata in one.values())
-    assert_equal(one, two)
-
-
-def _picture():
-    from PIL import Image
-
-    return Image.new("RGB", (4, 4), (250, 0, 0))
-
-
 def test_the_files_are_those_of_isaac_sims_structure(tmp_path):
     out = convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda")
     files = sorted(p.relative_to(out.parent).as_posix() for p in out.parent.rglob("*") if p.is_file())
@@ -154,24 +135,6 @@ def test_long_arrays_of_a_sensor_are_in_a_binary_layer(tmp_path):
     assert azimuth in kept
     assert_allclose(np.degrees([-1, 1]), np.array(two[sensor][azimuth][1])[[0, -1]], rtol=1e-6)
     assert_valid(out, tmp_path)
-
-
-def test_each_layer_contains_its_own_opinions(tmp_path):
-    out = convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda")
-    folder = out.parent / "payloads"
-    physical = ("physics:", "drive:", "newton:", "physx", "isaac:")
-
-    def properties(name):
-        found = []
-        layer = Sdf.Layer.FindOrOpen(str(folder / name))
-        layer.Traverse("/", lambda path: found.append(path.name) if path.IsPropertyPath() else None)
-        return found
-
-    for name in ("base.usda", "instances.usda", "materials.usda"):
-        assert not [p for p in properties(name) if p.startswith(physical)], name
-    assert all(p.startswith(("isaac:", "magtwin:")) for p in properties("robot.usda"))
-    assert all(p.startswith("physx") for p in properties("Physics/physx.usda"))
-    assert not properties("Physics/mujoco.usda")
 
 
 def test_variants_switch_the_physics_and_leave_the_looks(tmp_path):
@@ -222,17 +185,6 @@ def test_the_layers_of_another_robot_are_never_overwritten(tmp_path):
     assert before == {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
 
 
-def test_a_conversion_that_fails_leaves_nothing(tmp_path):
-    urdf = arm(tmp_path)
-
-    def fail(_):
-        raise InputError("no")
-
-    with pytest.raises(InputError, match="no"):
-        convert_urdf(urdf, tmp_path / "made" / "arm.usda", finish=fail)
-    assert not list((tmp_path / "made").iterdir())
-
-
 def test_metadata_come_from_the_package_unless_they_are_given(tmp_path):
     text = "<package><name>arms</name><author>A. Maker</author><license>BSD-3-Clause</license></package>"
     (tmp_path / "package.xml").write_text(text)
@@ -259,7 +211,7 @@ def test_invalid_metadata_is_refused(tmp_path, given, message):
 # --- gates ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("variant", sorted(set(VARIANTS) - {"physx"}))  # the default, in every other test
 def test_every_variant_passes_the_validators(tmp_path, variant):
     out = convert_urdf(arm(tmp_path), tmp_path / "made" / "arm.usda")
     text = out.read_text()

@@ -89,14 +89,6 @@ def test_a_phong_highlight_keeps_its_width_and_its_height(tmp_path, exponent):
     assert_allclose(height, linear_from_srgb([0.2, 0.1, 0]), rtol=0.02, atol=1e-5)
 
 
-def test_a_colour_multiplies_its_texture_unless_it_is_black(tmp_path):
-    picture(tmp_path / "t.png", [(255, 255, 255)])
-    _, surface = blue(tmp_path, "Kd 0.5 0.25 1\nmap_Kd t.png")
-    assert_allclose(textures(surface)["diffuseColor"][3][:3], linear_from_srgb([0.5, 0.25, 1]), atol=1e-5)
-    _, surface = blue(tmp_path, "Kd 0 0 0\nmap_Kd t.png")
-    assert_allclose(textures(surface)["diffuseColor"][3], [1, 1, 1, 1])
-
-
 def shaded(tmp_path, shader, extra="", images=""):
     """The stage of a COLLADA tetrahedron with this shader, and its surface."""
     path = dae(tmp_path / "n.dae", "<node>{mesh}</node>", images=images)

@@ -13,12 +13,11 @@ from validators import assert_valid
 
 from magtwin.author.scene import author_scene
 from magtwin.errors import InputError
-from magtwin.frames import rotate
 from magtwin.run.run import COLUMNS, Column, Run
 from magtwin.spec.robot import PlacedRobot
 from magtwin.twin import open_twin, simulate
 from magtwin.usd import trial
-from magtwin.usd.animation import is_animation, read_animation, write_animation
+from magtwin.usd.animation import read_animation, write_animation
 from magtwin.usd.geometry import read_links
 from magtwin.usd.layers import open_stage
 
@@ -72,18 +71,6 @@ def test_wheels_turn_about_their_axles_by_the_runs_angles(run, played):
         assert abs(frames["wheel_angle"][170, side]) > 1
 
 
-def test_a_second_has_the_frames_asked_for_and_the_end_is_the_runs(run, lab_scene, tmp_path, played):
-    stage = Usd.Stage.Open(str(played))
-    assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == 30
-    assert stage.GetStartTimeCode() == 0
-    assert stage.GetEndTimeCode() == pytest.approx(30 * run.duration_s)
-    write_animation(run, tmp_path / "all.usdc", lab_scene, fps=None)
-    whole = Usd.Stage.Open(str(tmp_path / "all.usdc"))
-    assert whole.GetTimeCodesPerSecond() == pytest.approx(135)
-    samples = whole.GetPrimAtPath("/World/turtlebot4").GetAttribute("xformOp:translate").GetTimeSamples()
-    assert_allclose(samples, run["t"] * 135, atol=1e-6)
-
-
 def test_the_magnetometers_prim_gives_its_readings_over_time(run, played):
     stage = Usd.Stage.Open(str(played))
     prim = stage.GetPrimAtPath(MAGNETOMETER)
@@ -96,16 +83,6 @@ def test_the_magnetometers_prim_gives_its_readings_over_time(run, played):
         assert attribute.GetDocumentation() == COLUMNS[name].doc
     vector = prim.GetAttribute("magtwin:magnetometer:bVectorNt").Get(40)
     assert_allclose(vector, frames["b_vector_nt"][40])
-
-
-def test_no_flag_is_lost_between_frames(run, played):
-    stage = Usd.Stage.Open(str(played))
-    lock = stage.GetPrimAtPath(MAGNETOMETER).GetAttribute("magtwin:magnetometer:flagLostLock")
-    bump = stage.GetPrimAtPath("/World/turtlebot4").GetAttribute("magtwin:robot:flagBump")
-    for row, t in enumerate(run["t"]):
-        code = Usd.TimeCode(t * 30 + 1e-6)
-        assert lock.Get(code) == run["flag_lost_lock"][row]
-        assert bump.Get(code) == run["flag_bump"][row]
 
 
 @pytest.mark.parametrize(("name", "fps"), [("a.usd", 30.0), ("a.usda", 10.0), ("a.usdc", None)])
@@ -171,23 +148,6 @@ print(len(values), values[5], first, "magtwin" in sys.modules)
     assert float(first) == run["b_total_nt"][0]
 
 
-@pytest.mark.usefixtures("allow_neighbours")
-def test_the_robot_is_seen_at_two_places_at_two_times(run, played):
-    """The magnetometer's lever arm moves with the robot: its prim is where the run says, early and late."""
-    stage = Usd.Stage.Open(str(played))
-    robot = open_twin(played, magnetometer="physical").scene.robot
-    seen = [world_pose(stage, MAGNETOMETER, code)[0] for code in (0, 170)]
-    rows = run.resample([0.0, 170 / 30])
-    wanted = rows["p_world_base"] + rotate(rows["q_world_base_xyzw"], robot.p_base_magnetometer)
-    assert_allclose(seen, wanted, atol=1e-9)
-    assert np.linalg.norm(seen[1] - seen[0]) > 0.5
-
-
-def test_only_what_plays_a_run_is_an_animation(played, lab_scene):
-    assert is_animation(played)
-    assert not is_animation(lab_scene)
-
-
 @pytest.mark.parametrize(
     ("columns", "options", "message"),
     [
@@ -215,15 +175,6 @@ def test_a_part_of_the_scene_is_never_replaced_by_what_plays_in_it(run, lab_scen
         with pytest.raises(InputError, match="is a part of the scene; give another name"):
             write_animation(run, part, lab_scene, force=True)
     assert lab_scene.read_bytes() == before
-
-
-def test_what_exists_is_kept_unless_forced_and_other_names_are_refused(run, played):
-    before = played.read_bytes()
-    with pytest.raises(InputError, match="exists already; give `force=True`"):
-        write_animation(run, played)
-    with pytest.raises(InputError, match="a USD file ends in"):
-        write_animation(run, played.with_suffix(".usdz"))
-    assert played.read_bytes() == before
 
 
 def test_files_that_play_nothing_or_are_damaged_are_refused(played, lab_scene, tmp_path):

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from pxr import Gf, Sdf, Usd, UsdGeom
+from pxr import Gf, Usd, UsdGeom
 
 import magtwin
 from magtwin.errors import InputError, MismatchWarning
@@ -159,29 +159,9 @@ def test_a_map_that_comes_by_reference_is_not_adopted(room, tmp_path):
     file = building(tmp_path, room, LabA=TURNED)
     with pytest.raises(InputError, match="no sublayer of this stage, so it cannot be replaced here"):
         survey_scene(file, tmp_path / "new.usdc", adopt=True, headings_rad=[0.0])
-    with pytest.raises(
-        InputError, match=r"new\.usdc: is not in the folder of .*; write the map into .*room$"
-    ):
+    with pytest.raises(InputError, match="write the map into"):
         survey_scene(room, tmp_path / "new.usdc", adopt=True, headings_rad=[0.0])
     assert not (tmp_path / "new.usdc").exists()
-
-
-def test_a_stronger_magnetization_in_a_stronger_layer_counts(room, tmp_path):
-    strong = tmp_path / "strong.usda"
-    layer = Sdf.Layer.CreateNew(str(strong))
-    layer.subLayerPaths = [str(room)]
-    layer.Save()
-    stage = Usd.Stage.Open(layer)
-    UsdGeom.SetStageMetersPerUnit(stage, 1)
-    UsdGeom.SetStageUpAxis(stage, "Z")
-    stage.GetPrimAtPath("/World/Sources/pipe").GetAttribute("magtwin:source:magnetizationAPerM").Set(
-        Gf.Vec3d(8000, 0, 4000)
-    )
-    stage.Save()
-    scene = read_scene(room)
-    twice = replace(scene, sources=(replace(scene.sources[0], magnetization=(8000.0, 0.0, 4000.0)),))
-    assert_allclose(field(strong), field_at_rest_nt(twice, AT, 0.4), rtol=1e-12)
-    assert "pipe is moved, or has another magnetization" in told(strong)
 
 
 def test_a_deleted_and_a_new_source_are_told_by_name(room):
@@ -192,15 +172,6 @@ def test_a_deleted_and_a_new_source_are_told_by_name(room):
     copy.GetAttribute("xformOp:translate").Set(Gf.Vec3d(1, 1, -0.5))
     stage.Save()
     assert "desk is gone; pipe2 is new" in told(room)
-
-
-def test_a_desk_in_an_instance_is_read_as_before(room):
-    before = field(room)
-    stage, desk = edited(room)
-    desk.SetInstanceable(True)
-    stage.Save()
-    assert_allclose(field(room), before, rtol=1e-12)
-    assert told(room) == ""
 
 
 # The robot
@@ -245,22 +216,6 @@ def test_a_second_robot_by_reference_needs_its_map(room):
 # Layers
 
 
-def test_the_session_layer_is_not_part_of_the_file(room):
-    before = field(room)
-    stage, desk = edited(room)
-    with Usd.EditContext(stage, stage.GetSessionLayer()):
-        desk.GetAttribute("xformOp:translate").Set(Gf.Vec3d(-0.5, 0.9, 0.0))
-    assert_allclose(field(room), before, rtol=0)
-    stage.GetSessionLayer().subLayerPaths = [str(room)]
-    saved = room.with_name("session.usda")
-    stage.GetSessionLayer().Export(str(saved))  # as usdview saves its overrides
-    layer = Sdf.Layer.FindOrOpen(str(saved))
-    layer.pseudoRoot.SetInfo("metersPerUnit", 1.0)
-    layer.pseudoRoot.SetInfo("upAxis", "Z")
-    layer.Save()
-    assert "desk is moved" in told(saved)
-
-
 def test_unsaved_changes_are_neither_lost_nor_overlooked(room):
     stage, desk = edited(room)
     desk.GetAttribute("xformOp:translate").Set(Gf.Vec3d(-0.5, 0.9, 0.0))
@@ -282,30 +237,6 @@ def test_a_moved_and_turned_lab_reads_the_same_bytes(room):
     stage.Save()
     assert np.array_equal(readings(room), here)
     assert told(room) == ""
-
-
-def test_a_lab_in_a_building_reads_the_same_bytes_wherever_it_stands(room, tmp_path):
-    here = readings(room)
-    file = building(tmp_path, room, LabA=TURNED, LabB={"Translate": Gf.Vec3d(-20, 0, 0), "RotateZ": 37.0})
-    with pytest.raises(InputError, match="has 2 labs, /Building/LabA, /Building/LabB; name one with `lab`"):
-        readings(file)
-    with pytest.raises(InputError, match="no lab is at '/Building/LabC'; known: /Building/LabA"):
-        readings(file, lab="/Building/LabC")
-    for lab in ("/Building/LabA", "/Building/LabB", "LabB"):
-        assert np.array_equal(readings(file, lab=lab), here)
-        assert told(file, lab=lab) == ""
-    run = magtwin.simulate(magtwin.open_twin(file, lab="LabA", network="none"), "sine", duration_s=0.5)
-    assert run.metadata["lab"] == "/Building/LabA"
-    p = [float(x) for x in run.metadata["lab_pose"].split()]
-    assert_allclose(p, [12.5, -7.25, 3.0, np.radians(37.0)], atol=1e-9)
-
-
-def test_labs_turned_against_each_other_contradict_in_the_earths_field(room, tmp_path):
-    file = building(tmp_path, room, LabA={}, LabB={"Translate": Gf.Vec3d(9, 0, 0), "RotateZ": 90.0})
-    scene = read_scene(file, lab="LabB")
-    assert scene.earth == read_scene(room).earth, "its own field turns with the lab"
-    horizontal = np.hypot(*scene.earth.b_world_nt[:2])
-    assert f"differs by {np.sqrt(2) * horizontal:,.0f} nT" in told(file, lab="LabB")
 
 
 def test_a_lab_without_an_earth_takes_that_of_the_building_into_its_axes(room, tmp_path):
@@ -355,16 +286,8 @@ def test_a_lab_that_does_not_stand_level_in_its_size_is_refused_by_prim(room, tm
 @pytest.mark.parametrize(
     ("path", "change", "words"),
     [
-        (
-            "/World/Lab",
-            lambda p: UsdGeom.XformCommonAPI(p).SetTranslate((1, 0, 0)),
-            "</World/Lab>: is moved.*move /World",
-        ),
-        (
-            ROBOT,
-            lambda p: UsdGeom.Xformable(p).AddScaleOp().Set(Gf.Vec3f(2)),
-            f"<{ROBOT}>: the robot is scaled",
-        ),
+        ("/World/Lab", lambda p: UsdGeom.XformCommonAPI(p).SetTranslate((1, 0, 0)), "Lab>: is moved"),
+        (ROBOT, lambda p: UsdGeom.Xformable(p).AddScaleOp().Set(Gf.Vec3f(2)), "the robot is scaled"),
         ("/World/AnomalyMap", lambda p: p.SetActive(False), "magnetometer:map must point to one prim"),
     ],
 )

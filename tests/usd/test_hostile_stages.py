@@ -6,10 +6,9 @@ import pytest
 from pxr import Sdf, Vt
 
 from magtwin.errors import InputError
-from magtwin.export.package import export_scene
 from magtwin.usd.geometry import read_colour_scale, read_links, read_shapes
 from magtwin.usd.info import info_of_stage
-from magtwin.usd.layers import open_layer, open_stage, stage_sha256
+from magtwin.usd.layers import open_layer, open_stage
 from magtwin.usd.trial import VALUES
 
 HEAD = '#usda 1.0\n(\n    defaultPrim = "World"\n    metersPerUnit = 1\n    upAxis = "Z"\n)\n'
@@ -85,16 +84,8 @@ REFUSED = [
     (with_('string xformOp:translate = "x"'), open_stage, r"</World> has xformOp:\S+ as .*; correct it"),
     (with_("double xformOp:rotateXYZ:first = 1"), open_stage, r"</World> has xformOp:\S+ as .*; correct it"),
     (with_("double3 xformOp:rotateX = (1, 2, 3)"), open_stage, r"</World> has xformOp:\S+ as .*; correct it"),
-    (
-        with_("quatf[] xformOp:orient = [(1, 0, 0, 0)]"),
-        open_stage,
-        r"</World> has xformOp:\S+ as .*; correct it",
-    ),
-    (
-        with_("matrix3d xformOp:transform:b:c = ((1, 0, 0), (0, 1, 0), (0, 0, 1))"),
-        open_stage,
-        r"</World> has xformOp:\S+ as .*; correct it",
-    ),
+    (with_("quatf[] xformOp:orient = [(1, 0, 0, 0)]"), open_stage, "has xformOp"),
+    (with_("matrix3d xformOp:transform:b:c = ((1, 0, 0), (0, 1, 0), (0, 0, 1))"), open_stage, "has xformOp"),
     (prim("Mesh", 'string[] points = ["a"]'), open_stage, "</World> has .*points as string"),
     (prim("Cube", 'string[] primvars:displayColor = ["a"]'), open_stage, "displayColor as string"),
     (prim("Cube", 'string physics:mass = "a"', MASS), open_stage, "mass as"),
@@ -115,19 +106,6 @@ def test_a_value_that_is_none_is_refused_in_one_line(text, read, words, tmp_path
     with pytest.raises(InputError, match=words) as refused:
         read(stage(tmp_path, text))
     assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        with_("float3 xformOp:translate = (1, 2, 3)"),
-        with_("half3 xformOp:rotateXYZ:first = (1, 2, 3)"),
-        with_("quatf xformOp:orient = (1, 0, 0, 0)"),
-        prim("Sphere", 'float radius = 2\ndef Scope "s"\n{\n    custom string radius = "large"\n}'),
-    ],
-)
-def test_other_precisions_and_other_attributes_of_the_same_name_are_read(text, tmp_path):
-    read_shapes(open_stage(stage(tmp_path, text)))
 
 
 def test_bodies_in_a_long_chain_have_one_base(tmp_path):
@@ -192,35 +170,3 @@ def test_chains_of_connections_and_relationships_end_the_trial_not_magtwin(tmp_p
         assert len(read_shapes(open_stage(stage(tmp_path, chain(100), f"{chain.__name__}.usda")))) == 1
         with pytest.raises(InputError, match=r"USD crashes on it|does not open it in"):
             open_stage(stage(tmp_path, chain(20_000), f"long_{chain.__name__}.usda"))
-
-
-def diamond(folder, levels):
-    """Layers of which each names the next two in a variant that is not selected."""
-    for i in range(levels, -1, -1):
-        names = ", ".join(f"@./a{k}.usda@" for k in (i + 1, i + 2) if k <= levels)
-        variant = f'    variantSet "v" = {{\n        "x" (\n            references = [{names}]\n        ) {{\n        }}\n    }}\n'
-        stage(
-            folder,
-            f'def "World" (\n    variantSets = "v"\n)\n{{\n{variant if names else ""}}}\n',
-            f"a{i}.usda",
-        )
-    return folder / "a0.usda"
-
-
-def test_layers_that_share_layers_are_summed_once(tmp_path):
-    assert len(stage_sha256(diamond(tmp_path, 40))) == 64
-    (tmp_path / "long").mkdir()
-    with pytest.raises(InputError, match="files that name each other"):
-        stage_sha256(diamond(tmp_path / "long", 300))
-
-
-def test_metadata_of_other_kinds_and_tiles_in_folders_are_packed(tmp_path):
-    (tmp_path / "<UDIM>").mkdir()
-    (tmp_path / "<UDIM>" / "x.png").write_bytes(b"x")
-    text = HEAD.replace(
-        "(\n", '(\n    customLayerData = {\n        string SimReady_Metadata = "none"\n    }\n'
-    )
-    text += 'def Cube "World"\n{\n    custom asset a = @./<UDIM>/x.png@\n}\n'
-    (tmp_path / "s.usda").write_text(text)
-    export_scene(tmp_path / "s.usda", tmp_path / "out")
-    assert (tmp_path / "out").is_dir()

@@ -1,6 +1,5 @@
 """CSV -> USD -> CSV: a survey comes back from its map's layer number by number."""
 
-import json
 from dataclasses import fields, replace
 
 import numpy as np
@@ -65,20 +64,6 @@ def test_a_fitted_map_comes_back_from_its_csvs_with_all_that_it_knew(tmp_path):
         assert (tmp_path / "again" / file.name).read_bytes() == file.read_bytes()
 
 
-def test_the_header_tells_the_statistics_of_its_heading(tmp_path):
-    made = survey(3, **FITTED)
-    write_survey(made, tmp_path / "csv")
-    lines = (tmp_path / "csv" / "180_map.csv").read_text().splitlines()
-    told = {k: json.loads(v) for k, _, v in (x[2:].partition(": ") for x in lines if ": " in x)}
-    values, valid = made.values_nt[2], made.valid[2]
-    assert told["mean_nt"] == pytest.approx(values[valid].mean(), rel=1e-15)
-    assert told["sd_nt"] == pytest.approx(values[valid].std(), rel=1e-12)
-    assert (told["least_nt"], told["greatest_nt"]) == (values[valid].min(), values[valid].max())
-    assert (told["heading_deg"], told["nodes"], told["masked"]) == (180.0, 15, int((~valid).sum()))
-    assert told["masked_rows"] == np.flatnonzero(~valid).tolist()
-    assert (told["median_error_nt"], told["spacing_m"]) == (9.0, [0.25, 0.25])
-
-
 def test_other_programs_read_our_csvs(tmp_path):
     made = survey(3, **FITTED)
     write_survey(made, tmp_path / "csv")
@@ -140,18 +125,6 @@ def test_any_survey_comes_back_from_csv_and_from_usd_to_the_bit(tmp_path_factory
     assert rows(folder / "csv") == rows(folder / "again")
 
 
-def test_a_map_that_is_no_survey_is_written_at_its_own_headings(tmp_path):
-    made = survey(recorded_yaw=None, values_nt=np.full((4, 3, 5), 45_000.0))
-    save_map(made, tmp_path / "a.usdc")
-    write_survey(load_map(tmp_path / "a.usdc"), tmp_path / "csv")
-    assert (tmp_path / "csv" / "90_map.csv").read_text().splitlines()[
-        -15
-    ] == f"-1.0,0.25,{np.pi / 2!r},45000.0"
-    attributes = ("magtwin:anomalyMap:recordedYawRad", "magtwin:anomalyMap:recordedNt")
-    prim = Usd.Stage.Open(str(tmp_path / "a.usdc")).GetPrimAtPath
-    assert not any(prim("/World/AnomalyMap").GetAttribute(name).HasAuthoredValue() for name in attributes)
-
-
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [
@@ -178,26 +151,3 @@ def test_a_map_with_a_node_without_a_value_is_not_written_as_a_survey(tmp_path):
     with pytest.raises(InputError, match="has no value at 1 of its nodes"):
         write_survey(made, tmp_path / "csv")
     assert not (tmp_path / "csv").exists()
-
-
-def test_info_of_a_map_and_of_its_csvs_tells_all_that_it_knows(tmp_path, capsys):
-    made = survey(3, **FITTED)
-    save_map(made, tmp_path / "a.usdc")
-    write_survey(made, tmp_path / "csv")
-    for file in ("a.usdc", "csv"):
-        main(["info", str(tmp_path / file), "--json"])
-        told = json.loads(capsys.readouterr().out)
-        figures, metadata = told["figures"], told["metadata"]
-        values = made.values_nt[1][made.valid[1]]
-        assert figures["heading 90"]["value"] == pytest.approx(values.mean(), abs=0.06)
-        assert figures["masked nodes"]["value"] == int((~made.valid).sum())
-        assert figures["standard deviation"]["value"] == 9.0
-        assert figures["height"]["value"] == 0.3
-        assert {"median gradient", "greatest gradient", "extent"} <= figures.keys()
-        assert (metadata["method"], metadata["parameters"]) == ("gp", made.parameters)
-        assert (metadata["frame"], metadata["created"], metadata["licence"]) == (
-            made.frame,
-            "2024-05-01",
-            "MIT",
-        )
-        assert metadata["headings deg"] == "0, 90, 180, 270"

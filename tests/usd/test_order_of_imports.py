@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 OURS = "import magtwin.usd\n"
 """USD knows the schemas before it is used."""
 
@@ -95,6 +97,7 @@ def done(first: str, folder: Path) -> tuple[dict[str, str], str, str]:
     return files_of(kept), result.stdout, result.stderr.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_every_use_of_the_schemas_gives_the_same_bytes_whether_usd_knows_them_or_not(tmp_path):
     files, texts, known = done(OURS, tmp_path)
     bare_files, bare_texts, bare_known = done(BARE, tmp_path)

@@ -18,8 +18,8 @@ from magtwin.errors import InputError, MismatchWarning
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files.file import shipped
 from magtwin.usd.maps.layer import load_map, save_map
-from magtwin.usd.schema import FILES, FOLDER, NOUNS, publish
-from magtwin.usd.schema.versions import TEXT, unknown_properties, version_of
+from magtwin.usd.schema import FILES, FOLDER, NOUNS
+from magtwin.usd.schema.versions import TEXT
 
 
 def heard(call, *args):
@@ -61,16 +61,6 @@ def test_a_name_that_the_schema_lacks_is_told_once_with_its_prim_and_the_nearest
     (told,) = texts
     assert re.search(f"edit.usda: </World/turtlebot4> has .*{said}", told), told
     assert heard(lambda: magtwin.open_twin(edit, network="none"))[1] == []
-
-
-def test_no_shipped_layer_and_no_run_has_a_name_that_the_schema_lacks(tmp_path):
-    run = magtwin.simulate("lab", "figure8", duration_s=2)
-    run.save(tmp_path / "run.usdc")
-    files = [file for part in ("maps", "robots", "scenes") for file in shipped(part).rglob("*.usd[ac]")]
-    assert len(files) >= 8
-    for file in (*files, tmp_path / "run.usdc"):
-        assert unknown_properties(Sdf.Layer.OpenAsAnonymous(str(file))) == [], file
-        assert version_of(Sdf.Layer.OpenAsAnonymous(str(file))) == (1, 0)
 
 
 @pytest.mark.parametrize(
@@ -187,22 +177,3 @@ def test_bare_usd_shows_the_published_folder_with_its_names_groups_texts_and_fal
                 wanted[prop.name] = ["rel", *shown, "rel", text]
     assert json.loads(done.stdout) == wanted
     assert len(wanted) > 190
-
-
-@pytest.mark.parametrize("first", ["", "from pxr import Plug; Plug.Registry().GetAllPlugins(); "])
-def test_an_older_library_on_the_path_is_not_used(tmp_path, first):
-    publish(tmp_path / "schema")
-    info = tmp_path / "schema" / "plugInfo.json"
-    info.write_text(info.read_text().replace('"schemaVersion": "1.0"', '"schemaVersion": "0.9"'))
-    where = "from pxr import Plug; print(Plug.Registry().GetPluginWithName('magtwin').resourcePath)"
-    done = subprocess.run(
-        [sys.executable, "-c", f"{first}import magtwin.usd; {where}"],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"PXR_PLUGINPATH_NAME": str(tmp_path / "schema")},
-    )
-    if first:
-        assert "InputError: USD loads version 0.9 of magtwin's schemas from" in done.stderr
-    else:
-        assert done.stdout.strip() == str(FOLDER)

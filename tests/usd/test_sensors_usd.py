@@ -21,7 +21,6 @@ from magtwin.spec.sensors import (
     MocapSpec,
 )
 from magtwin.usd import sensors
-from magtwin.usd.attributes import read_pose
 
 LINK = "/robot/some_link"
 
@@ -138,18 +137,6 @@ def test_a_spec_survives_the_stage_to_the_bit(noun, data):
     assert read(prim) == spec
 
 
-@unhurried
-@given(st.data())
-def test_a_drive_survives_the_stage(data):
-    names = data.draw(st.lists(name, min_size=2, max_size=5, unique=True))
-    joints = dict(zip(sensors.JOINT_FIELDS, names, strict=False))
-    joints |= dict(zip(sensors.WHEELS_FIELDS, (tuple(names[2:3]), tuple(names[3:])), strict=True))
-    known = {field: st.just(value) for field, value in joints.items()}
-    spec = data.draw(figures_of(DriveSpec, **known, yaw_slip=st.just(0.25), slip_s2_m=st.just(0.0)))
-    stage = stage_with_wheels(spec)
-    assert sensors.read_drive(sensors.define_drive(stage.GetPrimAtPath("/robot"), spec)) == spec
-
-
 def test_a_sensor_is_placed_where_the_spec_says():
     stage = stage_with_link()
     UsdGeom.XformCommonAPI(stage.GetPrimAtPath(LINK)).SetTranslate((0, 0, 1))
@@ -158,42 +145,6 @@ def test_a_sensor_is_placed_where_the_spec_says():
     prim = sensors.define_imu(stage, f"{LINK}/imu", spec)
     world = UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())
     assert Gf.IsClose(world.Transform(Gf.Vec3d(1, 0, 0)), Gf.Vec3d(1, 3, 4), 1e-12)
-
-
-def test_a_pose_that_others_wrote_as_a_matrix_is_read():
-    stage = stage_with_link()
-    matrix = Gf.Matrix4d(Gf.Rotation(Gf.Vec3d(0, 0, 1), 90), Gf.Vec3d(1, 2, 3))
-    UsdGeom.Xformable(stage.GetPrimAtPath(LINK)).MakeMatrixXform().Set(matrix)
-    p, q = read_pose(stage.GetPrimAtPath(LINK))
-    assert p == (1, 2, 3)
-    assert q == pytest.approx((0, 0, 0.5**0.5, 0.5**0.5))
-
-
-def test_a_turn_that_others_wrote_in_single_or_half_precision_is_read_at_unit_length():
-    stage = stage_with_link()
-    for kind, quaternion in (("half", Gf.Quath), ("single", Gf.Quatf)):
-        prim = sensors.define_imu(stage, f"{LINK}/{kind}", ImuSpec(link="some_link"))
-        prim.RemoveProperty("xformOp:orient")
-        names = {"half": Sdf.ValueTypeNames.Quath, "single": Sdf.ValueTypeNames.Quatf}
-        prim.CreateAttribute("xformOp:orient", names[kind], custom=False).Set(quaternion(0.6, 0.8, 0, 0))
-        q = sensors.read_imu(prim).q_link_sensor_xyzw
-        assert np.linalg.norm(q) == pytest.approx(1, abs=1e-15)
-        assert q == pytest.approx((0.8, 0, 0, 0.6), abs=5e-4)
-
-
-def test_every_figure_is_authored_also_one_that_equals_the_schemas_fallback():
-    stage = stage_with_link()
-    battery = sensors.define_battery(stage, "/robot/battery", BatterySpec())
-    magnetometer = sensors.define_magnetometer(stage, f"{LINK}/mag", MagnetometerSpec(link="some_link"))
-    platform = sensors.define_platform(stage.GetPrimAtPath("/robot"), PlatformFieldSpec())
-    footprint = sensors.define_footprint(stage.GetPrimAtPath("/robot"), 0.171)
-    for prim, noun in ((battery, "battery"), (platform, "platform"), (footprint, "robot:footprint")):
-        figures = [a for a in prim.GetAttributes() if a.GetName().startswith(f"magtwin:{noun}")]
-        assert figures
-        assert all(a.HasAuthoredValue() for a in figures)
-    figures = [a for a in magnetometer.GetAttributes() if a.GetName().startswith("magtwin")]
-    unsaid = {a.GetName().split(":")[-1] for a in figures if not a.HasAuthoredValue()}
-    assert unsaid == {"network", "networkSha256", "inputs", "mapSha256"}, "what is empty says nothing"
 
 
 def test_a_layer_over_a_sensor_holds_only_what_it_changes():
@@ -246,18 +197,6 @@ def test_nvidias_imu_and_lidar_carry_what_they_can():
     assert omni.GetAttribute("omni:sensor:Core:farRangeM").Get() == 8.0
 
 
-def test_a_missing_network_is_read_as_where_it_should_be(tmp_path):
-    (tmp_path / "a").mkdir()
-    stage = Usd.Stage.CreateNew(str(tmp_path / "a" / "s.usda"))
-    UsdGeom.Xform.Define(stage, LINK)
-    spec = MagnetometerSpec(link="some_link", network=tmp_path / "gone.safetensors")
-    prim = sensors.define_magnetometer(stage, f"{LINK}/mag", spec)
-    assert sensors.read_magnetometer(prim) == spec
-    over = Usd.Stage.CreateNew(str(tmp_path / "over.usda"))
-    over.GetRootLayer().subLayerPaths.append("./a/s.usda")
-    assert sensors.read_magnetometer(over.GetPrimAtPath(f"{LINK}/mag")) == spec
-
-
 def battery_of_text(stage):
     battery = stage.GetRootLayer().GetPrimAtPath("/robot/battery")
     battery.RemoveProperty(battery.attributes["magtwin:battery:loadW"])
@@ -280,44 +219,16 @@ TURN = Gf.Quatd(1, 1, 0, 0)
 @pytest.mark.parametrize(
     ("noun", "change", "words"),
     [
-        (
-            "battery",
-            put("/robot/battery", "magtwin:battery:capacityWh", -1.0),
-            "battery>: capacity_wh .* above 0",
-        ),
-        (
-            "battery",
-            put("/robot/battery", "magtwin:battery:loadW", float("nan")),
-            "load_w .* finite, got nan",
-        ),
-        (
-            "battery",
-            put("/robot/battery", "magtwin:battery:voltageFullV", 5.0),
-            "voltage_full_v .*voltage_empty_v",
-        ),
+        ("battery", put("/robot/battery", "magtwin:battery:capacityWh", -1.0), "capacity_wh"),
+        ("battery", put("/robot/battery", "magtwin:battery:loadW", float("nan")), "finite, got nan"),
+        ("battery", put("/robot/battery", "magtwin:battery:voltageFullV", 5.0), "voltage_empty_v"),
         ("battery", battery_of_text, "magtwin:battery:loadW must be a double, got"),
-        (
-            "imu",
-            put(f"{LINK}/imu", "magtwin:imu:gyroNoiseStdRadPerS", float("inf")),
-            "link/imu>: gyro_noise_std",
-        ),
-        (
-            "imu",
-            put(f"{LINK}/imu", "xformOp:orient", TURN),
-            "link/imu>: q_link_sensor_xyzw .* unit quaternion",
-        ),
-        (
-            "lidar",
-            put(f"{LINK}/lidar", "magtwin:lidar:rangeMinM", 12.0),
-            "link/lidar>: range_min_m .* range_max_m",
-        ),
-        ("drive", one_joint, "</robot>: right_wheel_joint .* differ"),
-        (
-            "drive",
-            lambda stage: stage.RemovePrim("/robot/joints/left_wheel_joint"),
-            "leftWheelJoint must point",
-        ),
-        ("plain", lambda stage: None, "</robot>: has no MagtwinBatteryAPI"),
+        ("imu", put(f"{LINK}/imu", "magtwin:imu:gyroNoiseStdRadPerS", float("inf")), "gyro_noise_std"),
+        ("imu", put(f"{LINK}/imu", "xformOp:orient", TURN), "q_link_sensor_xyzw"),
+        ("lidar", put(f"{LINK}/lidar", "magtwin:lidar:rangeMinM", 12.0), "range_min_m"),
+        ("drive", one_joint, "right_wheel_joint .* differ"),
+        ("drive", lambda stage: stage.RemovePrim("/robot/joints/left_wheel_joint"), "leftWheelJoint must"),
+        ("plain", lambda stage: None, "has no MagtwinBatteryAPI"),
     ],
 )
 def test_what_makes_no_sense_is_refused_by_prim(noun, change, words):
@@ -331,7 +242,7 @@ def test_what_makes_no_sense_is_refused_by_prim(noun, change, words):
         "plain": lambda: robot,
     }[noun]()
     change(stage)
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=f"</robot.*{words}"):
         {"plain": sensors.read_battery}.get(noun, getattr(sensors, f"read_{noun}", None))(prim)
 
 

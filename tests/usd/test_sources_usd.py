@@ -1,6 +1,5 @@
 """Magnetised things and the Earth's field through the stage and back; moved, instanced, broken."""
 
-import datetime
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,7 @@ from magtwin.field.sources.magnets import body_of
 from magtwin.frames import rotate
 from magtwin.spec.furniture import KINDS, FurnitureSpec, parts_of
 from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
-from magtwin.usd.lab.earth import DERIVED_FROM, checked, define_earth, read_earth
+from magtwin.usd.lab.earth import checked, define_earth, read_earth
 from magtwin.usd.lab.furniture import FURNITURE, define_furniture, read_magnets
 from magtwin.usd.lab.sources import SOURCES, define_source, define_sources, read_source
 from magtwin.usd.schema import apply_api, attribute_name
@@ -79,13 +78,6 @@ def the_source(stage: Usd.Stage, of: SourceSpec = BAR) -> Usd.Prim:
 
 
 @unhurried
-@given(st.builds(SourceSpec, name=name, p_world=vec3, m_world=vec3))
-def test_a_dipole_survives_the_stage(spec):
-    stage = stage_of(spec)
-    assert read_magnets(stage) == ((spec,), ())
-
-
-@unhurried
 @given(st.sampled_from(sorted(sizes)), st.data())
 def test_a_body_survives_the_stage_to_the_bit(shape, data):
     spec = SourceSpec(
@@ -110,44 +102,6 @@ def test_a_mesh_survives_the_stage_to_the_bit(corners, turn, magnetization):
     assert read_magnets(stage_of(spec)) == ((spec,), ())
 
 
-@unhurried
-@given(st.sampled_from(sorted(KINDS)), vec3, unit, st.floats(-1e4, 1e4), st.floats(0, 1e3))
-def test_furniture_survives_the_stage_as_furniture(kind, p, turn, strength, susceptibility):
-    steel = sum(part.steel for part in parts_of(kind))
-    spec = FurnitureSpec(
-        name="piece",
-        kind=kind,
-        p_world=p,
-        q_world_xyzw=turn,
-        magnetization=tuple(strength + k for k in range(steel)),
-        susceptibility=susceptibility,
-    )
-    stage = world()
-    define_furniture(stage, (spec,))
-    assert read_magnets(stage) == ((), (spec,))
-
-
-@unhurried
-@given(
-    st.builds(
-        EarthFieldSpec,
-        b_world_nt=vec3,
-        latitude_deg=st.floats(-90, 90),
-        longitude_deg=st.floats(-180, 360),
-        height_m=number,
-        date=st.dates(max_value=datetime.date(2030, 1, 1)).map(str),
-        north_deg=st.floats(-360, 360),
-        measured=st.just(True),
-    ),
-    st.booleans(),
-)
-def test_the_earths_field_survives_the_stage(spec, measured):
-    if spec.date >= "1900-01-01":
-        spec = replace(spec, measured=measured)
-    stage = world()
-    assert read_earth(define_earth(stage, "/World/Earth", spec)) == spec
-
-
 # Where things stand
 
 
@@ -159,14 +113,6 @@ def test_moving_turning_and_nesting_a_prim_moves_and_turns_the_source():
     assert_allclose(read.p_world, (1.0, -0.5, 1.0), atol=1e-12)
     assert_allclose(rotate(read.q_world_xyzw, read.magnetization), (0, -2e3, 0), atol=1e-9)
     assert_allclose(read.size_m, BAR.size_m, rtol=1e-12)
-
-
-def test_a_moved_piece_of_furniture_is_that_piece_at_its_new_place():
-    stage = world()
-    define_furniture(stage, (DESK,))
-    prim = stage.GetPrimAtPath(FURNITURE.AppendChild("desk"))
-    prim.GetAttribute("xformOp:translate").Set(Gf.Vec3d(1.0, -2.5, 0.0))
-    assert read_magnets(stage) == ((), (replace(DESK, p_world=(1.0, -2.5, 0.0)),))
 
 
 def test_furniture_of_which_a_part_was_changed_comes_back_as_the_sources_that_it_consists_of():
@@ -209,13 +155,6 @@ def test_a_desk_from_another_file_counts_and_so_do_instances_and_what_is_invisib
     assert len(read_magnets(stage)[1]) == 1
 
 
-def test_things_of_one_name_get_names_of_their_own():
-    stage = world()
-    for place in ("hall/beam", "cellar/beam", "hall_beam"):
-        apply_api(UsdGeom.Xform.Define(stage, f"/World/{place}").GetPrim(), "source")
-    assert [s.name for s in read_magnets(stage)[0]] == ["hall_beam", "cellar_beam", "hall_beam_2"]
-
-
 @pytest.mark.parametrize("axis", ["X", "Y", "Z"])
 def test_a_cylinders_axis_and_scale_are_its_shape_and_leave_its_magnetization(axis):
     stage = world()
@@ -233,14 +172,6 @@ def test_a_cylinders_axis_and_scale_are_its_shape_and_leave_its_magnetization(ax
     assert_allclose(read.size_m, (0.1, 0.1, 6.0), rtol=1e-6)
     assert_allclose(rotate(read.q_world_xyzw, (0, 0, 1)), np.eye(3)["XYZ".index(axis)], atol=1e-12)
     assert_allclose(rotate(read.q_world_xyzw, read.magnetization), (1, 2, 3), rtol=1e-12)
-
-
-def test_a_bodys_moment_is_its_magnetization_times_its_volume():
-    stage = stage_of(replace(BAR, magnetization=(0.0, 0.0, 0.0)))
-    the_source(stage).GetAttribute("magtwin:source:momentAm2").Set((0, 0, 3.0))
-    body = body_of(read_magnets(stage)[0][0])
-    assert body.volume_m3 == pytest.approx(np.pi * 0.01**2 * 0.8)
-    assert_allclose(body.volume_m3 * body.magnetization, (0, 0, 3), rtol=1e-12)
 
 
 def test_a_mesh_with_doubled_vertices_polygons_and_faces_turned_inwards_is_the_same_body():
@@ -298,11 +229,7 @@ def test_what_cannot_be_a_source_is_refused_by_prim(change, words):
 @pytest.mark.parametrize(
     ("attribute", "value", "words"),
     [
-        (
-            "faceVertexIndices",
-            [0, 2, 1, 0, 1, 3, 1, 2, 3, 0, 3, 1],
-            "not a closed mesh: the edge from .* to ",
-        ),
+        ("faceVertexIndices", [0, 2, 1, 0, 1, 3, 1, 2, 3, 0, 3, 1], "not a closed mesh: the edge from"),
         ("faceVertexIndices", [0, 2, 1, 0, 1, 3, 1, 2, 3, 0, 3, 9], "12 indices and 4 points do not fit"),
         ("faceVertexCounts", [3, 3, 3], "9 corners, 12 indices and 4 points do not fit"),
         ("points", [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)], "encloses no volume"),
@@ -346,9 +273,7 @@ def test_names_that_are_none_are_refused_by_the_near_one_and_steel_is_counted():
         define_source(world(), "/World", SourceSpec(name="steel beam", p_world=(0, 0, 0), m_world=(0, 0, 1)))
     with pytest.raises(InputError, match="no furniture 'dsek'; did you mean 'desk'"):
         FurnitureSpec(name="a", kind="dsek", p_world=(0, 0, 0))
-    with pytest.raises(
-        InputError, match=r"magnetization .* one number for each of leg_0, leg_1, .*rail_1, got"
-    ):
+    with pytest.raises(InputError, match="one number for each of leg_0, leg_1"):
         FurnitureSpec(name="a", kind="desk", p_world=(0, 0, 0), magnetization=(1e3,))
 
 
@@ -373,16 +298,6 @@ def test_every_part_wears_a_material_collides_and_stands_within_the_piece(kind):
         .ComputeAlignedRange()
     )
     assert box.GetMin()[2] == pytest.approx(0, abs=1e-6)  # it stands on the floor
-
-
-def test_no_two_parts_of_a_piece_of_steel_share_their_volume_by_more_than_a_joint():
-    for kind in KINDS:
-        steel = [(np.array(part.p), np.array(part.size_m)) for part in parts_of(kind) if part.steel]
-        for k, (p, size) in enumerate(steel):
-            for q, other in steel[:k]:
-                low, high = np.maximum(p - size / 2, q - other / 2), np.minimum(p + size / 2, q + other / 2)
-                shared = np.prod(np.maximum(high - low, 0))
-                assert shared <= 0.002 * min(np.prod(size), np.prod(other)) + 1e-12, kind
 
 
 # The Earth
@@ -428,11 +343,3 @@ def test_an_earth_that_makes_no_sense_is_refused_by_prim(attribute, value, said)
     prim.GetAttribute(f"magtwin:earth:{attribute}").Set(value)
     with pytest.raises(InputError, match=f"</World/Earth>: {said}"):
         read_earth(prim)
-
-
-def test_a_measured_field_may_be_of_any_day():
-    late = replace(EARTH, measured=True, date="2041-01-01")
-    stage = world()
-    prim = define_earth(stage, "/World/Earth", late)
-    assert read_earth(prim) == late
-    assert prim.GetAttribute(DERIVED_FROM).Get() == ""

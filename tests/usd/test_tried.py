@@ -1,11 +1,9 @@
 """A stage that passed its trial costs nothing in the next command; a changed one is tried again."""
 
-import json
 import os
 
 import pytest
 
-from magtwin.errors import InputError
 from magtwin.files.folders import allow
 from magtwin.usd import trial, tried
 
@@ -69,28 +67,6 @@ def test_a_missing_file_that_appears_and_other_circumstances_are_tried(stage, tm
     assert tries(stage)
 
 
-def test_what_was_written_just_now_and_refusals_are_not_remembered(stage, tmp_path, monkeypatch):
-    monkeypatch.setattr(tried, "YOUNGEST_S", 2.0)
-    assert [tries(stage) for _ in range(2)] == [True, True]
-    monkeypatch.setattr(tried, "YOUNGEST_S", 0.0)
-    (tmp_path / "outside.usda").write_text("#usda 1.0\n")
-    stage.write_text(ROOT.replace("./below", "../outside"))
-    for _ in range(3):
-        with pytest.raises(InputError, match="outside the stage's folder"):
-            tries(stage)
-    assert not (tmp_path / "cache").exists()
-
-
-@pytest.mark.parametrize(
-    "damage", ["", "{}", "[]", "null", '{"FILE": null}', '{"FILE": [1, 2]}', "\x80", "[" * 9999]
-)
-def test_a_damaged_memory_is_ignored(damage, stage, tmp_path):
-    assert tries(stage)
-    (file,) = (tmp_path / "cache" / "magtwin" / "trials").iterdir()
-    file.write_bytes(damage.replace("FILE", str(stage)).encode("latin-1"))
-    assert [tries(stage), tries(stage)] == [True, False]
-
-
 def test_a_memory_that_others_can_change_or_that_cannot_be_written_is_ignored(stage, tmp_path, monkeypatch):
     assert tries(stage)
     folder = tmp_path / "cache" / "magtwin" / "trials"
@@ -106,14 +82,3 @@ def test_a_memory_that_others_can_change_or_that_cannot_be_written_is_ignored(st
     assert tries(stage)
     monkeypatch.setenv("XDG_CACHE_HOME", str(stage))  # a file
     assert [tries(stage), tries(stage)] == [True, True]
-
-
-def test_the_memory_stays_small(stage, tmp_path, monkeypatch):
-    monkeypatch.setattr(tried, "MOST", 2)
-    for number in range(4):
-        (root := stage.with_name(f"root{number}.usda")).write_text(ROOT)
-        assert tries(root)
-    assert [tries(stage.with_name(f"root{number}.usda")) for number in (3, 2)] == [False, False]
-    files = list((tmp_path / "cache" / "magtwin" / "trials").iterdir())
-    assert all(json.loads(file.read_text()) for file in files)
-    assert len(files) == 2

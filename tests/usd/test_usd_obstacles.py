@@ -108,21 +108,6 @@ def test_what_a_tall_robot_would_run_into_is_an_obstacle_to_it():
     assert read_obstacles(made).names == ("/Shelf",)
 
 
-def test_a_body_that_moves_is_no_obstacle():
-    made = stage()
-    robot = UsdGeom.Xform.Define(made, "/Robot")
-    UsdPhysics.RigidBodyAPI.Apply(robot.GetPrim())
-    box(made, "/Robot/Hull", (0, 0, 0.1), (0.3, 0.3, 0.2))
-    assert len(read_obstacles(made)) == 0
-
-
-def test_a_collider_of_purpose_guide_counts():
-    made = stage()
-    cube = box(made, "/Fence", (0, 2, 0.2), (2, 0.1, 0.4))
-    cube.CreatePurposeAttr(UsdGeom.Tokens.guide)
-    assert read_obstacles(made).names == ("/Fence",)
-
-
 def test_the_lab_s_walls_and_posts_surround_its_floor(lab_scene):
     found = read_obstacles(str(lab_scene))
     walls = [name for name in found.names if "/Walls/" in name]

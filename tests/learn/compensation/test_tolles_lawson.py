@@ -11,11 +11,9 @@ from places import DOCS
 from scipy.signal import butter, sosfilt, sosfilt_zi
 from scipy.spatial.transform import Rotation
 
-from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files.file import shipped
-from magtwin.io.tables import write_parquet
 from magtwin.learn.compensation.tolles_lawson import (
     TollesLawson,
     band_pass,
@@ -121,16 +119,6 @@ def test_coefficients_of_a_linear_platform_come_back():
     assert model.residual_sd_nt < 1e-3
 
 
-def test_a_constant_bias_is_fitted_without_a_band():
-    b = manoeuvres(200)
-    readings = np.linalg.norm(with_platform(b), axis=1) + 1234.0
-    model = fit_tolles_lawson(
-        readings - np.linalg.norm(EARTH_NT), b, RATE_HZ, terms=("permanent", "eddy9", "bias"), band_hz=None
-    )
-    assert model.coefficients[-1] == pytest.approx(1234.0, abs=400)
-    assert abs(np.mean(model.compensate(readings, b, RATE_HZ)) - np.linalg.norm(EARTH_NT)) < 1
-
-
 @pytest.fixture(scope="module")
 def calibration():
     """A robot that drives about in a uniform field, above a map that knows only that field."""
@@ -221,15 +209,6 @@ def test_what_cannot_be_fitted_is_refused(change, says):
         fit_tolles_lawson(**given)
 
 
-def test_compensate_takes_a_preset_and_keeps_it(calibration, tmp_path, capsys):
-    run, model = tmp_path / "run.parquet", tmp_path / "model.json"
-    write_parquet(calibration("figure8", 1), run)
-    main(["compensate", "fit", str(run), "--preset", "magnav", "--no-band", "--out", str(model), "--json"])
-    assert json.loads(capsys.readouterr().out)["metadata"]["preset"] == "magnav"
-    assert TollesLawson.load(model).preset == "magnav"
-    assert TollesLawson.load(model) == fit_run(calibration("figure8", 1), band_hz=None, preset="magnav")
-
-
 def test_the_page_on_compensation_takes_out_what_it_says():
     page = DOCS / "compensate.md"
     (code,) = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
@@ -293,29 +272,10 @@ def test_the_preset_magnav_gives_its_arrays(penalty, tmp_path):
     assert np.std(default - compensated) > 0.01
 
 
-def test_the_presets_own_penalty_leaves_the_noise_and_that_of_magnavs_test_far_more():
-    b, readings = figure_of_merit_flight(10.0)
-    left = {
-        ridge: float(np.std(fit.compensate(readings, b, 10.0)))
-        for ridge in (None, 1e-3)
-        for fit in [fit_tolles_lawson(readings, b, 10.0, ridge=ridge, preset="magnav")]
-    }
-    page = (DOCS / "compensate.md").read_text()
-    (line,) = re.findall(
-        r"the default leaves ([\d.]+) nT of (\d+) nT.*?`ridge=1e-3` leaves\s+(\d+) nT", page, re.DOTALL
-    )
-    assert [float(word) for word in line] == [round(left[None], 1), round(readings.std()), round(left[1e-3])]
-    assert left[None] < 0.6  # the noise of a reading is 0.5 nT
-    assert "ridge=1e-3, preset" not in page
-
-
 def test_the_figures_of_both_reports_are_those_of_the_raw_arrays(calibration):
     run = calibration("figure8", seed=1)
     model = fit_run(run, band_hz=None, ridge=1e-6)
-    vector, field = (
-        run["b_vector_measured_nt"],
-        run["b_measured_nt"] - run["b_map_nt"],
-    )
+    vector, field = (run["b_vector_measured_nt"], run["b_measured_nt"] - run["b_map_nt"])
     fine = np.isfinite(field) & np.isfinite(vector).all(axis=1)
     assert fine[np.argmax(fine) :].all()  # so that the longest stretch is all of it
     b, y = vector[fine], field[fine]
@@ -335,15 +295,3 @@ def test_the_figures_of_both_reports_are_those_of_the_raw_arrays(calibration):
     assert_allclose((compensated["b_measured_nt"] - run["b_map_nt"])[fine] - y.mean(), left, atol=1e-6)
     assert f"standard deviation {left.std():,.0f} nT against {y.std():,.0f} nT" in report.verdict
     assert f"a ratio of {left.std() / y.std():.2f}" in report.verdict
-
-
-def test_the_preset_magnav_drops_the_terms_along_z_and_takes_a_bias():
-    b, readings = figure_of_merit_flight(10.0)
-    _, names = design_matrix(b, 10.0, ("induced5", "eddy8", "bias"), preset="magnav")
-    assert "induced yy" in names
-    assert not {"induced zz", "eddy zdz"} & set(names)
-    both = [
-        fit_tolles_lawson(readings, b, 10.0, terms=terms, preset="magnav").compensate(readings, b, 10.0)
-        for terms in (("permanent", "induced6", "eddy9"), ("permanent", "induced6", "eddy9", "bias"))
-    ]
-    assert np.std(both[0] - both[1]) < 0.5

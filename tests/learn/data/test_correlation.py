@@ -25,12 +25,6 @@ def test_it_is_scipys_with_ties_too_and_an_input_that_never_varies_has_none():
     assert np.isnan(found.rho[3])
 
 
-def test_a_rising_function_changes_nothing():
-    x, y, groups = some()
-    risen = correlations(np.exp(x), y**3, NAMES, groups)
-    assert_allclose(risen.rho, correlations(x, y, NAMES, groups).rho, atol=1e-12)
-
-
 def test_the_spread_is_that_between_groups_not_that_of_so_many_alike_rows():
     """Eight runs repeated tenfold know no more than eight runs."""
     x, y, groups = some()

@@ -7,13 +7,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
 from magtwin.io.tables import read_parquet
-from magtwin.learn.data import dataset as rooms
 from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import build_dataset, open_dataset
 from magtwin.learn.data.features import features
 from magtwin.learn.data.labels import labelled
-from magtwin.learn.data.recording import Source, thinned
-from magtwin.learn.data.split import split
+from magtwin.learn.data.recording import Source
 from magtwin.run.run import Run
 
 FIELD, a_run = hills(variance=400.0), a_drive
@@ -77,24 +75,6 @@ def test_rows_without_a_label_or_with_a_nan_input_are_left_out_and_counted(tmp_p
     assert len(found.rows("full").y) == 230
 
 
-def test_blocks_of_any_size_give_the_same_rows(tmp_path, monkeypatch, made):
-    monkeypatch.setattr(rooms, "BLOCK_ROWS", 64)
-    found = build_dataset(RUNS, FIELD, tmp_path / "d")
-    for part in ("train", "test"):
-        dealt = split(found.recordings, "row", rng=np.random.default_rng(0))
-        one, other = (d.rows("full", split=dealt, part=part) for d in (found, made))
-        assert_array_equal(one.x, other.x)
-        assert_array_equal(one.recording, other.recording)
-        assert 0 < len(one.y) < 600
-
-
-def test_a_split_by_run_gives_whole_recordings(made):
-    dealt = split(made.recordings, "run", rng=np.random.default_rng(1))
-    assert made.rows("full", split=dealt, part="test").names == dealt.test
-    total = sum(len(made.rows("full", split=dealt, part=part).y) for part in ("train", "validation", "test"))
-    assert total == 720
-
-
 def test_the_same_runs_give_the_same_bytes_and_shards_are_runs_for_anyone(made, tmp_path):
     again = build_dataset(RUNS, FIELD, tmp_path / "again")
     for name in ("dataset.json", "runs/a.parquet"):
@@ -134,11 +114,6 @@ def test_a_lower_rate_keeps_labels_where_every_second_reading_is_lost(tmp_path, 
     assert_array_equal(made["t"][1:], run["t"][1:-1:2])
 
 
-def test_a_clock_of_the_smallest_steps_is_thinned():
-    run = RUNS["a"].with_columns(t=np.arange(RUNS["a"].rows) * 5e-324)
-    assert thinned(run, 5.0).rows == 1
-
-
 def test_an_input_that_is_no_measurement_is_refused(tmp_path):
     run = RUNS["a"].with_columns(battery_a=np.full(RUNS["a"].rows, 1e300))
     with pytest.raises(InputError, match=r"'a', row 0: input 'battery_a' is 1e\+300"):
@@ -153,17 +128,6 @@ def test_a_source_is_read_when_its_turn_comes_and_names_its_session(tmp_path):
     assert told == ["a", "b"]
     assert {(one.session, one.path) for one in found.recordings} == {("monday", "p")}
     assert seen == [(0, 2, "a"), (1, 2, "b"), (2, 2, "")]
-
-
-def test_the_report_says_what_there_is_to_learn_from(made):
-    report = made.report()
-    figures = {figure.name: figure for figure in report.figures}
-    assert figures["labels"].value == 720
-    assert figures["sessions"].value == 3
-    assert figures["label"].spread == pytest.approx(np.std(made.rows("full").y), rel=1e-6)
-    assert (
-        report.metadata["feature sets"] == "full, correlated, circular, gradient, platform, session, vector"
-    )
 
 
 A = RUNS["a"]

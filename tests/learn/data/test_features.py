@@ -5,16 +5,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.errors import InputError
 from magtwin.learn.compensation.tolles_lawson import design_matrix
-from magtwin.learn.data.features import (
-    EDDY,
-    FEATURES,
-    FULL,
-    INDUCED,
-    SETS,
-    feature_names,
-    features,
-    warming,
-)
+from magtwin.learn.data.features import EDDY, FEATURES, FULL, INDUCED, SETS, features, warming
 from magtwin.run.run import COLUMNS, Run
 
 
@@ -51,17 +42,6 @@ def test_q_and_minus_q_give_the_same_features_with_w_not_negative():
     turned = run.with_columns(imu_q_xyzw=-run["imu_q_xyzw"])
     assert_array_equal(features(run), features(turned))
     assert (features(run, ["imu_q_w"]) >= 0).all()
-
-
-def test_lidar_is_0_or_1():
-    assert set(np.unique(features(a_run(), ["lidar_on"]))) == {0.0, 1.0}
-
-
-def test_features_come_in_the_order_they_are_named_in():
-    run = a_run()
-    x = features(run, ["battery_v", "yaw_deg", "odom_w_z"])
-    assert_array_equal(x[:, 0], run["battery_v"])
-    assert_array_equal(x[:, 2], run["odom_w"][:, 2])
 
 
 def test_every_feature_of_a_set_is_known_and_comes_from_a_column_of_a_run():
@@ -128,13 +108,6 @@ def test_nothing_in_circular_tells_one_session_from_another():
         assert_array_equal(features(other, name), features(run, name))
 
 
-def test_the_size_of_the_measured_vector_is_in_no_feature():
-    """It is what is to be predicted."""
-    run = a_run()
-    louder = run.with_columns(b_vector_measured_nt=run["b_vector_measured_nt"] * 1.07)
-    assert_allclose(features(louder, "vector"), features(run, "vector"), rtol=1e-12)
-
-
 def test_induced_and_eddy_products_are_those_of_tolles_and_lawson_in_a_field_that_stands_still():
     rate, t = 400.0, np.arange(400) / 400.0
     yaw = 0.8 * np.sin(3 * t)
@@ -148,17 +121,6 @@ def test_induced_and_eddy_products_are_those_of_tolles_and_lawson_in_a_field_tha
     for name, theirs in ours.items():
         x = features(run, [name])[5:-5, 0]
         assert_allclose(x, matrix[5:-5, names.index(theirs)], atol=2e-4)
-
-
-def test_a_field_of_nothing_has_no_direction():
-    run = a_run(3).with_columns(b_vector_measured_nt=np.zeros((3, 3)))
-    assert np.isnan(features(run, ["cosine_x", "induced_xx"])).all()
-
-
-def test_names_in_one_text_are_a_set_a_feature_or_several_with_commas():
-    assert feature_names("full") == FULL
-    assert feature_names("lidar_on") == ("lidar_on",)
-    assert feature_names("yaw_deg, lidar_on") == ("yaw_deg", "lidar_on")
 
 
 def test_what_warms_up_has_63_percent_of_its_field_after_one_time_constant():

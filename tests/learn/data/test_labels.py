@@ -9,7 +9,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files.file import shipped
 from magtwin.frames import quat_from_yaw
-from magtwin.learn.data.alignment import Alignment, _sandwich, fit_alignment
+from magtwin.learn.data.alignment import Alignment, fit_alignment
 from magtwin.learn.data.labels import labelled
 from magtwin.run.run import Run
 
@@ -97,14 +97,6 @@ def test_motion_capture_is_the_pose_where_there_is_one():
     assert_allclose(taken["yaw"], run["yaw"], atol=1e-12)
 
 
-def test_a_quaternion_of_zero_is_a_lost_pose():
-    run = a_run()
-    lost = np.arange(run.rows) % 10 == 0
-    q = np.where(lost[:, None], 0.0, quat_from_yaw(run["yaw"]))
-    run = run.with_columns(mocap_p=np.where(lost[:, None], 0.0, run["p_world_base"]), mocap_q_xyzw=q)
-    assert_array_equal(np.isfinite(labelled(run, FIELD)["label_nt"]), ~lost)
-
-
 def test_a_labelled_run_is_whole_and_says_what_its_labels_are():
     run = labelled(a_run(), FIELD)
     known = np.isfinite(run["label_nt"])
@@ -125,33 +117,6 @@ def test_lever_arm_and_latency_are_found_together_to_their_stated_spread():
     assert_allclose(got, truth, atol=0.004)
     assert (np.abs(got - truth) < 4 * sd + 0.002).all()
     assert (sd < 0.01).all()
-
-
-def test_errors_shared_within_groups_make_the_spread_of_students_t():
-    rng, x, group = np.random.default_rng(0), np.ones((60, 1)), np.repeat(np.arange(6), 10)
-    within = 0
-    for _ in range(2000):
-        y = rng.normal(0, 1, 6)[group]
-        spread = _sandwich(np.array([[1 / 60]]), x, y - y.mean(), group)
-        within += abs(y.mean()) < 1.645 * np.sqrt(spread[0, 0])
-    assert within / 2000 == pytest.approx(0.9, abs=0.02)
-    assert_array_equal(_sandwich(np.eye(1), x, y, 0 * group), 0.0)
-
-
-def test_more_readings_of_the_same_places_do_not_hide_the_errors_of_a_map():
-    """The map errs by waves of 1 m; the robot drives the same way again and again."""
-    rng = np.random.default_rng(1)
-    x, y = np.meshgrid(FIELD.x_m, FIELD.y_m)
-    bumps = [
-        12 * np.cos(kx * x + ky * y + phase)
-        for kx, ky, phase in zip(*rng.normal(0, 6, (2, 20)), rng.uniform(0, 6, 20), strict=True)
-    ]
-    wrong = dataclasses.replace(FIELD, values_nt=FIELD.values_nt + np.sum(bumps, axis=0))
-    few, many = (
-        np.array(fit_alignment([a_run(seed=k, seconds=40) for k in range(n)], wrong).lever_arm_sd_m)
-        for n in (2, 8)
-    )
-    assert (many > 0.8 * few).all()
 
 
 @pytest.mark.slow

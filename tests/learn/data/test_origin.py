@@ -12,9 +12,8 @@ from magtwin.cli import main
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files.file import sha256, shipped
-from magtwin.learn.data.origin import label_frame, map_metadata, mismatches, shared_metadata
+from magtwin.learn.data.origin import label_frame, map_metadata, mismatches
 from magtwin.sim.runs.simulate import robot_metadata
-from magtwin.sim.session import draw_session
 from magtwin.spec.sensors import MocapSpec
 from magtwin.twin import in_session, open_twin, sweep
 from magtwin.usd.maps.layer import save_map
@@ -58,16 +57,6 @@ def found(metadata, *, field=None, map_sha256="a" * 64, robot=ROBOT, platform="p
     )
 
 
-def test_where_map_robot_and_place_are_those_it_learned_there_is_nothing_to_tell():
-    assert found(learned()) == ()
-    session = draw_session(ROBOT, np.random.default_rng(0))
-    assert found(learned(), robot=session) == ()
-
-
-def test_a_map_of_another_file_with_the_same_values_is_the_same_map():
-    assert found(learned(), map_sha256="b" * 64) == ()
-
-
 @pytest.mark.parametrize(("other", "rms"), [(a_map(250.0), 250.0), (a_map(0, 4300.0), 300 * 2 / 3**0.5)])
 def test_another_map_is_told_with_the_rms_difference_of_the_two(other, rms):
     (one,) = found(learned(), field=other, map_sha256="b" * 64)
@@ -95,12 +84,6 @@ def test_labels_that_were_aligned_or_took_true_poses_lie_in_the_frame_of_a_run()
     assert found(aligned) == found(learned(robot=robot)) == ()
 
 
-def test_a_real_robot_does_not_tell_its_frame_and_nothing_is_said_of_it():
-    unknown = dict.fromkeys(("robot_name", "sensor_m", "mocap_offset_m", "mocap_latency_s"), "unknown")
-    assert label_frame(learned(poses="mocap") | unknown) is None
-    assert found(learned(poses="mocap") | unknown) == ()
-
-
 def test_another_robot_with_its_sensor_elsewhere_is_grave():
     other = dataclasses.replace(ROBOT, name="husky", p_base_magnetometer=(0.3, 0.0, 0.9))
     (one,) = found(learned(), robot=other, platform="q")
@@ -117,24 +100,12 @@ def test_a_sensor_that_was_moved_is_told_with_the_map_s_change_over_the_way():
     assert told == pytest.approx(SLOPE * 0.1 / 2**0.5, rel=0.1)
 
 
-def test_another_platform_is_told_and_another_name_alone_is_nothing():
-    assert "another [platform]" in found(learned(), platform="q")[0].text
-    assert found(learned(), robot=dataclasses.replace(ROBOT, name="burger")) == ()
-
-
 @pytest.mark.parametrize(
     "fact", [{"sensor_m": "here"}, {"lever_arm_m": "1"}, {"map_samples_nt": "1 2 3", "map_sha256": "b" * 64}]
 )
 def test_metadata_that_are_no_numbers_are_refused_by_name(fact):
     with pytest.raises(InputError, match=f"f.safetensors: its metadata '{next(iter(fact))}' must list"):
         found(learned() | fact)
-
-
-def test_recordings_tell_one_robot_none_or_several():
-    own, other = robot_metadata(ROBOT), {"robot_name": "husky"}
-    assert shared_metadata([own, own])["robot_name"] == "turtlebot4"
-    assert shared_metadata([own, other])["robot_name"] == "several"
-    assert shared_metadata([{}, {}])["robot_name"] == "unknown"
 
 
 def test_a_run_tells_its_robot_and_motion_capture_as_it_was_in_the_session(lab_scene):

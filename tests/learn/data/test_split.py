@@ -40,26 +40,10 @@ def test_nothing_is_on_two_sides_and_nothing_is_lost(by):
         assert not found.leak
 
 
-def test_parts_have_their_shares_of_labelled_rows():
-    found = deal(by="run")
-    rows = {one.name: one.labelled for one in LOG}
-    got = [sum(rows[name] for name in found.names(part)) / sum(rows.values()) for part in PARTS]
-    assert got == pytest.approx([0.7, 0.15, 0.15], abs=0.05)
-
-
 def test_the_seed_decides_and_the_order_of_recordings_does_not():
     assert deal(seed=1) == deal(seed=1)
     assert deal(seed=1) != deal(seed=2)
     assert set(deal(LOG[::-1], seed=1).test) == set(deal(seed=1).test)
-
-
-def test_what_is_held_out_is_the_whole_test():
-    found = deal(by="path", hold_out=["figure8"])
-    assert found.test == tuple(one.name for one in LOG if one.path == "figure8")
-    assert found.train
-    assert found.validation
-    one = deal(by="session", hold_out=["run_03"])
-    assert set(one.test) == {r.name for r in LOG if r.session == "day 3"}
 
 
 def test_a_split_by_row_deals_rows_of_every_run_once_and_says_that_it_leaks():

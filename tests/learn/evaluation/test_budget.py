@@ -15,7 +15,6 @@ from magtwin.learn.evaluation.budget import TERMS, Truth, at_rest_nt, budget
 from magtwin.learn.evaluation.candidates import naive, named_map, tolles_lawson
 from magtwin.learn.evaluation.evaluate import evaluate
 from magtwin.run.run import Run
-from magtwin.sim.at_rest import field_at_rest_nt
 from magtwin.twin import check_scene, in_session_of, open_twin, simulate
 
 SEED = 11
@@ -81,27 +80,6 @@ def test_the_parts_of_a_label_add_up_to_it(truth, drives, named):
     )  # fields of 4e4 nT, double precision
 
 
-def test_the_exact_field_is_that_of_a_robot_at_rest(twin):
-    p = np.random.default_rng(0).uniform(-1.4, 1.4, (40, 2))
-    yaw = np.linspace(-3, 3, 40)
-    assert_allclose(at_rest_nt(twin.scene, p, yaw), field_at_rest_nt(twin.scene, p, yaw), atol=1e-3)
-    p[3] = np.nan
-    assert np.isnan(at_rest_nt(twin.scene, p, yaw)[3])
-
-
-def test_a_robot_with_the_true_lever_arm_and_no_drift_errs_by_neither(twin, named):
-    still = Truth(twin.scene, lambda name, run: twin.scene)
-    run = simulate(twin, "figure8", seed=3, duration_s=10.0, rate_hz=10.0)
-    rows = np.arange(5, run.rows)
-    parts = still.parts("a", run, rows, named.field.lookup(run["p_world_base"][rows, :2], run["yaw"][rows]),
-                        Alignment(twin.scene.robot.mocap.offset_m), run["b_measured_nt"][rows])  # fmt: skip
-    told = dict(zip(TERMS, parts, strict=True))
-    assert np.abs(told["lever arm"]).max() == 0
-    assert np.abs(told["sessions"]).max() == 0
-    assert_allclose(told["sensor"], -run["b_noise_nt"][rows], atol=1e-6)
-    assert np.abs(told["latency"]).max() > 0  # of motion capture, which comes late
-
-
 def test_all_terms_closed_leave_nothing_and_its_figures_are_told_by_term(made):
     for one in made:
         assert one.left_nt[-1] == pytest.approx(0, abs=1e-6)
@@ -126,10 +104,7 @@ def test_closing_the_map_leaves_what_naive_errs_by_on_an_exact_map(made, found, 
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (
-            lambda run: run.with_metadata(config_sha256="0" * 64),
-            "made in a scene whose values have",
-        ),
+        (lambda run: run.with_metadata(config_sha256="0" * 64), "made in a scene whose values have"),
         (lambda run: Run({k: v for k, v in run.items() if k != "b_truth_nt"}, run.metadata), "no b_truth_nt"),
     ],
 )

@@ -13,15 +13,7 @@ from magtwin.learn.data.features import features as features_of
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.data.recording import Source
 from magtwin.learn.data.split import split
-from magtwin.learn.evaluation.candidates import (
-    NAIVE,
-    Candidate,
-    Mean,
-    candidate_of,
-    naive,
-    named_map,
-    tolles_lawson,
-)
+from magtwin.learn.evaluation.candidates import NAIVE, Candidate, Mean, candidate_of, naive, named_map
 from magtwin.learn.evaluation.evaluate import evaluate, trials_of, unlearned, unseen
 from magtwin.learn.training.config import TrainConfig
 from magtwin.learn.training.train import fit
@@ -77,13 +69,6 @@ def test_an_error_is_map_and_prediction_less_what_was_measured():
     assert found.every.scores[0].ratio == 1.0
 
 
-def test_models_on_different_maps_are_judged_by_the_total_field():
-    found = judged([FLAT, Candidate("other", Mean(-200.0, 100.0), HIGHER)])
-    first, second = found.every.scores
-    assert second.mae_nt == pytest.approx(first.mae_nt)
-    assert second.bias_nt == pytest.approx(first.bias_nt)
-
-
 def test_a_model_looks_its_map_up_with_its_own_lever_arm_and_latency():
     alignment = Alignment((0.05, -0.02), 0.1)
     run = a_run(5, path="figure8")
@@ -119,25 +104,11 @@ def test_the_noise_floor_of_a_map_is_the_mean_size_of_a_normal_error_of_its_own_
     assert mae == pytest.approx(20.0 * np.sqrt(2 / np.pi))
 
 
-def test_naive_is_the_mean_training_label_on_the_map_at_hand(data):
-    assert naive(HILLS, dataset=data).model.mean_nt == pytest.approx(
-        np.mean(np.concatenate([run["label_nt"] for _, run in data.runs()]))
-    )
-    on_higher = naive(HIGHER, dataset=data).model.mean_nt
-    assert on_higher == pytest.approx(naive(HILLS, dataset=data).model.mean_nt - 500)
-
-
 def test_weights_tell_their_mean_label_where_no_training_set_is_at_hand(weights):
     own = candidate_of(weights[0], [HILLS])
     assert naive(HILLS, weights=[own]).model.mean_nt == own.metadata["label_mean_nt"]
     with pytest.raises(InputError, match="the mean training label on the map higher"):
         naive(HIGHER, weights=[own])
-
-
-def test_tolles_lawson_beats_the_mean_where_speed_makes_a_field(data):
-    found = judged([naive(HILLS, dataset=data), tolles_lawson(HILLS, data)])
-    assert found.every.scores[1].mae_nt == pytest.approx(20 * np.sqrt(2 / np.pi), rel=0.15)
-    assert found.every.scores[1].ratio < 0.3
 
 
 def test_weights_take_the_map_that_they_were_trained_on_by_its_checksum(weights):
@@ -219,17 +190,6 @@ def test_the_figures_of_a_report_are_those_of_the_raw_arrays(data, weights):
     assert f"hold {wanted['coverage']:.0%} of the readings" in line
 
 
-def test_the_exact_field_judges_where_it_is_asked_for():
-    run = a_run(2, path="figure8")
-    exact = run.with_columns(b_truth_nt=run["b_measured_nt"] + 50)
-    found = judged([FLAT], trial(run=exact), truth=True)
-    assert found.every.scores[0].bias_nt == pytest.approx(
-        judged([FLAT], trial(run=exact)).every.scores[0].bias_nt - 50
-    )
-    with pytest.raises(InputError, match="one: has no b_truth_nt"):
-        judged([FLAT], trial(run=run), truth=True)
-
-
 def constant(run):
     return run.with_columns(b_measured_nt=HILLS.field.lookup(run["p_world_base"][:, :2], run["yaw"]) + 5)
 
@@ -252,9 +212,7 @@ def test_readings_on_no_common_ground_are_refused_with_counts():
     left[0, :, 21:] = False
     right[0, :, :20] = False
     halves = [named_map(name, hills(name, valid=v)) for name, v in (("left", left), ("right", right))]
-    with pytest.raises(
-        InputError, match=r"no reading that every model can be judged on: \d+ have no label on"
-    ):
+    with pytest.raises(InputError, match="no reading that every model can be judged"):
         judged([Candidate(one.name, Mean(0.0, 1.0), one) for one in halves])
 
 

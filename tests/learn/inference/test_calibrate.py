@@ -1,7 +1,6 @@
 """Mixed models from a data set, calibrated by a drive, followed online, and used like any predictor."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import magtwin as mt
 from magtwin.cli import main
-from magtwin.errors import CalibrationWarning, InputError
+from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files.file import sha256
 from magtwin.learn.data.features import features
@@ -138,16 +137,6 @@ def test_a_calibrated_file_records_its_drive_and_its_parent(weights, tmp_path):
     )
 
 
-def test_the_date_of_a_bag_is_recorded_and_the_error_of_a_single_block_is_unknown(model, tmp_path):
-    run = a_run(3, seconds=14.0)
-    bag = Run(dict(run), {"start_ns": str(1_790_000_000 * 10**9)})
-    with pytest.warns(CalibrationWarning):
-        calibrated = mt.calibrate(model, bag, anomaly_map=FIELD, out=tmp_path / "a.safetensors")
-    assert calibrated.metadata["calibration_date"] == "2026-09-21"
-    assert "calibration_residual_nt" not in calibrated.metadata
-    assert np.isnan(load_predictor(tmp_path / "a.safetensors").residual_sd_nt)
-
-
 def test_the_figures_of_its_report_are_those_of_the_raw_arrays(model):
     run = a_run(31, "hysteresis")
     now = mt.calibrate(model, run, anomaly_map=FIELD)
@@ -184,22 +173,6 @@ def test_the_figures_of_its_report_are_those_of_the_raw_arrays(model):
     )
     assert now.metadata["calibration_readings"] == len(drive.y)
     assert now.metadata["calibration_duration_s"] == drive.t[-1] - drive.t[0]
-
-
-def test_a_poor_drive_is_warned_of(model):
-    for run, options, text in (
-        (a_run(3, seconds=20.0), {}, "it lasts 20 s, and 30 s are needed"),
-        (a_run(3, sector=np.pi / 4), {}, "its headings lie in 2 of 12 sectors"),
-        (a_run(3), {"pose_from_map": True}, "were estimated on the magnetic map"),
-        (Run(dict(a_run(3)), {"pose_from_map": True}), {}, "were estimated on the magnetic map"),
-    ):
-        with pytest.warns(CalibrationWarning, match=text) as given:
-            calibrated = mt.calibrate(model, run, anomaly_map=FIELD, **options)
-        assert len(given) == 1
-        assert text.split(",")[0] in calibrated.metadata["calibration_warnings"]
-    other = replace(FIELD, values_nt=FIELD.values_nt[:, ::-1], name="b")
-    with pytest.warns(CalibrationWarning, match="trained on the map 'trough' and is calibrated on another"):
-        mt.calibrate(model, a_run(3), anomaly_map=other)
 
 
 def test_what_cannot_calibrate_is_refused_in_a_line(model, weights, tmp_path):

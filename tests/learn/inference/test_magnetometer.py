@@ -2,7 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from learn_drives import random_run as a_run
 from numpy.testing import assert_allclose, assert_array_equal
 from test_network import RELEASED, a_net
 from threadpoolctl import threadpool_limits
@@ -11,7 +10,7 @@ from magtwin.errors import InputError
 from magtwin.files.file import sha256, shipped
 from magtwin.learn.data.features import FULL
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
-from magtwin.learn.models.perceptron import in_threads, threads_of_products
+from magtwin.learn.models.perceptron import threads_of_products
 from magtwin.learn.models.predictor import load_predictor
 from magtwin.sim.session import session_of
 from magtwin.twin import open_twin, sweep
@@ -54,11 +53,6 @@ def test_the_released_network_errs_by_less_than_a_hundredth_nt_against_float64(r
     assert_allclose(released.net.predict(x)[0], forward64(released.net, x), atol=0.01)  # of up to 8,000 nT
 
 
-def test_blocks_agree_with_torch_on_the_whole_array(paper):
-    x = inputs(paper.net, 1500)
-    assert_allclose(paper.net.predict(x)[0], by_torch(paper.net, x), atol=1e-3)
-
-
 @pytest.mark.parametrize("shape", [(20, 512, 512, 512, 512), (14, 64, 64), (1, 3), (5, 17, 1, 8)])
 def test_a_rows_bytes_depend_neither_on_its_neighbours_nor_on_how_many_rows_there_are(shape):
     """Features of 1 to 20 and layers of 1 to 512 take different kernels of the library of products."""
@@ -79,23 +73,6 @@ def test_one_thread_and_two_give_the_same_bytes_and_the_number_of_threads_stays(
         assert threads_of_products() == 2
     with threadpool_limits(1):
         assert_array_equal(paper.net.predict(x)[0], two)
-
-
-def test_nan_in_gives_nan_out_in_that_row_alone(paper):
-    x = inputs(paper.net, 600)
-    clean = paper.net.predict(x)[0]
-    x[[3, 555], [0, 19]] = np.nan
-    y = paper.net.predict(x)[0]
-    assert_array_equal(np.flatnonzero(np.isnan(y)), [3, 555])
-    assert_array_equal(np.delete(y, [3, 555]), np.delete(clean, [3, 555]))
-
-
-def test_a_run_is_read_by_the_names_of_the_networks_inputs():
-    net = a_net(["odom_w_z", "yaw_deg", "battery_v"])
-    run = a_run(40)
-    x = np.column_stack([run["odom_w"][:, 2], np.degrees(run["yaw"]) % 360, run["battery_v"]])
-    (read,) = NeuralMagnetometer(net).read([run])
-    assert_allclose(read.disturbance_nt, forward64(net, x), atol=1e-3)
 
 
 def test_an_input_beyond_its_training_range_is_outside():
@@ -129,13 +106,6 @@ def test_the_metadata_name_the_file_its_checksum_and_its_shape(tmp_path):
     assert magnetometer.residual_sd_nt == 55.0
     with pytest.raises(InputError, match=f"its sha256 is {sha256(path)}, expected 00ff"):
         NeuralMagnetometer.load(path, sha256="00ff")
-
-
-def test_a_row_beyond_float32_gives_no_number_and_no_warning(paper):
-    x = inputs(paper.net, 3)
-    x[1] = 1e300
-    y = paper.net.predict(x)[0]
-    assert np.isfinite(y).tolist() == [True, False, True]
 
 
 # The networks that ship
@@ -181,18 +151,3 @@ def test_the_shipped_network_does_better_than_the_mean_label_on_days_and_paths_i
     naive = np.abs(label - shipped_network.net.metadata["label_mean_nt"]).mean()
     share = {"mlp": 0.85, "hybrid": 0.5}[shipped_network.net.kind]  # the cards: 0.66 and 0.27
     assert np.abs(found - label).mean() < share * naive
-
-
-def test_work_is_done_in_each_thread_and_the_first_failure_is_raised_after_all_ended():
-    before, done = threads_of_products(), []
-    in_threads(lambda: done.append(threads_of_products()), 3)
-    assert done == [1, 1, 1]
-
-    def fails():
-        done.append(0)
-        raise ArithmeticError("no")
-
-    with pytest.raises(ArithmeticError, match="no"):
-        in_threads(fails, 2)
-    assert done == [1, 1, 1, 0, 0]
-    assert threads_of_products() == before

@@ -1,5 +1,4 @@
 import json
-import os
 import sys
 
 import numpy as np
@@ -7,14 +6,14 @@ import onnx
 import onnxruntime
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from test_magnetometer import by_torch, inputs
+from test_magnetometer import inputs
 from test_network import RELEASED, a_net
 from test_predictor import KINDS, a_predictor
 
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.files.file import sha256
-from magtwin.learn.data.features import FEATURES, FULL
+from magtwin.learn.data.features import FEATURES
 from magtwin.learn.inference.onnx import export_onnx, model_of, report_onnx
 from magtwin.learn.models.predictor import load_predictor
 
@@ -38,16 +37,6 @@ def exported(weights):
     """The same as ONNX."""
     export_onnx(weights, weights.with_name("n.onnx"))
     return weights.with_name("n.onnx")
-
-
-@pytest.mark.parametrize("hidden", [(512, 512, 512, 512), (7,)])
-def test_onnxruntime_gives_what_torch_gives(tmp_path, hidden):
-    net = a_net(FULL, hidden)
-    net.save(tmp_path / "n.safetensors")
-    export_onnx(tmp_path / "n.safetensors", tmp_path / "n.onnx")
-    for rows in (1, 300):
-        x = inputs(net, rows)
-        assert_allclose(run(tmp_path / "n.onnx", x)[0], by_torch(net, x), atol=1e-3)
 
 
 def test_the_released_network_gives_in_onnxruntime_what_it_gives_here(real_data, tmp_path):
@@ -115,15 +104,6 @@ def test_without_its_packages_it_says_how_to_get_them(weights, exported, tmp_pat
             with pytest.raises(InputError, match=r"pip install 'magtwin\[onnx\]'"):
                 export_onnx(weights, tmp_path / "n.onnx")
     assert not list(tmp_path.iterdir())
-
-
-def test_onnxruntime_writes_no_telemetry_unless_the_user_wants_it(weights, tmp_path, monkeypatch):
-    monkeypatch.delenv("ORT_DISABLE_TELEMETRY", raising=False)
-    export_onnx(weights, tmp_path / "n.onnx")
-    assert os.environ["ORT_DISABLE_TELEMETRY"] == "1"
-    monkeypatch.setenv("ORT_DISABLE_TELEMETRY", "0")
-    export_onnx(weights, tmp_path / "n.onnx", force=True)
-    assert os.environ["ORT_DISABLE_TELEMETRY"] == "0"
 
 
 def test_a_runtime_that_gives_something_else_writes_nothing(weights, tmp_path, monkeypatch):

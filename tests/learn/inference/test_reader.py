@@ -14,7 +14,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.learn.data.features import FEATURES, FULL, SETS, features
 from magtwin.learn.data.inputs import inputs_of
 from magtwin.learn.inference import reader
-from magtwin.learn.inference.reader import POSE, Reader
+from magtwin.learn.inference.reader import Reader
 from magtwin.learn.models.predictor import load_predictor
 from magtwin.run.run import COLUMNS
 
@@ -89,13 +89,6 @@ def test_every_kind_is_read_as_in_a_run(kind, run, field):
     assert [one.outside_training for one in read] == predictor.outside(x).tolist()
 
 
-@pytest.mark.parametrize("kind", ["linear", "hybrid"])
-def test_nan_in_gives_nan_out_of_every_kind(kind, run, field):
-    reader = Reader(a_predictor(kind), field)
-    reading = reader.read((0.0, 0.0), 0.0, signals_of(reader, run, 0) | {"battery_a": math.nan})
-    assert np.isnan([reading.b_total_nt, reading.b_disturbance_nt, reading.b_sd_nt]).all()
-
-
 def test_a_reading_of_the_released_network_errs_by_less_than_a_hundredth_nt(real_data, field):
     net = load_predictor(real_data / RELEASED)
     reader, x = Reader(net, field), inputs(net, 200)
@@ -129,12 +122,6 @@ def test_nan_in_gives_nan_out_and_off_the_map_nothing_is_known(field, run):
     assert math.isnan(reading.b_total_nt)
     assert reading.outside_training
     assert not math.isnan(reader.read((0.0, 0.0), 0.0, signals).b_total_nt)  # nothing of it stays
-
-
-def test_signals_are_those_that_pose_and_map_do_not_give(field):
-    reader = Reader(a_net("gradient", (4,)), field)
-    assert set(reader.signals) == {"odom_v", "odom_w", "imu_w", "imu_a", "battery_a", "lidar_on"}
-    assert not set(POSE) & set(reader.signals)
 
 
 @pytest.mark.parametrize(

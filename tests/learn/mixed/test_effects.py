@@ -16,7 +16,6 @@ from magtwin.learn.mixed.effects import (
     posterior,
     shares,
     sums_of,
-    thinned_rows,
 )
 
 P = 5
@@ -102,18 +101,6 @@ def test_a_drive_in_blocks_has_the_posterior_of_all_its_readings():
     assert drive.left_out_nt == pytest.approx(20.0, rel=0.4)
 
 
-def test_intervals_hold_on_sessions_of_the_prior():
-    prior, held = a_prior(), []
-    for seed in range(60):
-        phi, y, variance = a_session(prior, 300, seed)
-        early, t = np.arange(300) < 240, np.arange(300) / 4
-        drive = effects_of_drive(prior, phi[early], y[early], variance[early], t[early])
-        mean, spread = drive.effects.predict(phi[~early])
-        sd = drive.widening * np.sqrt(variance[~early] + spread)
-        held.append(np.mean(np.abs(mean - y[~early]) < 1.645 * sd))
-    assert np.mean(held) == pytest.approx(0.9, abs=0.04)
-
-
 def kernel_of_time(prior, phi, t, at, t_at):
     """Covariance of phi' beta at two times: beta is an Ornstein-Uhlenbeck process about mu."""
     return (at @ prior.covariance @ phi.T) * np.exp(-np.abs(t_at[:, None] - t) / MEMORY_S)
@@ -150,14 +137,6 @@ def test_readings_that_are_too_close_late_or_unknown_are_skipped():
     assert filtered.count == 2
 
 
-def test_long_without_readings_it_returns_to_the_prior():
-    prior = a_prior()
-    filtered = FollowedEffects(prior)
-    filtered.update(0.0, np.ones(P), 1e4, 1.0)
-    assert np.abs(filtered.mean - prior.mean).max() > 1.0
-    assert_allclose(filtered.effects(20 * MEMORY_S).mean, prior.mean, atol=1e-3)
-
-
 def test_errors_larger_than_thought_widen_what_follows():
     prior, rng = a_prior(size=1.0), np.random.default_rng(0)
 
@@ -170,8 +149,3 @@ def test_errors_larger_than_thought_widen_what_follows():
 
     assert widening(20.0) == pytest.approx(1.0, abs=0.15)
     assert widening(60.0) == pytest.approx(2.7, abs=0.5)  # a prior of 30 s pulls towards 1
-
-
-def test_thinned_rows_are_a_quarter_second_apart_and_begin_anew_with_time():
-    t = np.append(np.arange(100) / 100, np.arange(100) / 100)
-    assert thinned_rows(t).tolist() == [0, 25, 50, 75, 100, 125, 150, 175]

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from magtwin.learn.models.calibration import (
-    Spread,
     few_groups_factor,
     fit_spread,
     quantile_factor,
@@ -28,17 +27,6 @@ def test_the_spread_of_errors_that_grow_with_an_input_is_found():
     assert math.sqrt(spread.floor_nt2) == pytest.approx(30, rel=0.05)
     assert np.sqrt(spread.slopes_nt2[1]) == pytest.approx(80, rel=0.05)
     assert np.all(np.sqrt(spread.slopes_nt2[[0, 2]]) < 8)
-
-
-def test_a_spread_is_nan_where_an_input_is_and_grows_as_it_is_told():
-    spread = Spread(9.0, np.array([16.0, 0.0]))
-    assert spread.sd_nt(np.array([[1.0, 5.0], [0.0, 0.0]])).tolist() == [5.0, 3.0]
-    assert spread.scaled(2.0).sd_nt(np.array([[1.0, 0.0]])).tolist() == [10.0]
-    assert np.isnan(spread.sd_nt(np.array([[0.0, np.nan]]))).all()
-
-
-def test_errors_that_never_were_leave_a_width():
-    assert fit_spread(np.zeros((10, 2)), np.zeros(10)).floor_nt2 > 0
 
 
 def test_the_factor_makes_nine_of_ten_rows_lie_within():

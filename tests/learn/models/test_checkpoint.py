@@ -206,10 +206,7 @@ HUGE = torch.zeros(1).expand(10**6, 10**6)
         (saved(layers(20, 4, 2)), "'layers.1.weight' is float32 (2, 4)"),
         (saved({"layer0.weight": torch.ones(4, 20)}), "'layers.0.bias' is missing"),
         (saved(GOOD | {"layer0.weight": torch.ones(20)}), "'layers.0.weight' is float32 (20,); a layer's"),
-        (
-            saved(GOOD | {"norm.running_mean": torch.ones(4)}),
-            "'norm.running_mean' is neither weight",
-        ),
+        (saved(GOOD | {"norm.running_mean": torch.ones(4)}), "'norm.running_mean' is neither weight"),
         (saved(GOOD | {"layer0.weight": NAN}), "'layers.0.weight' has numbers that are nan"),
         (saved(GOOD | {"layer0.weight": 3}), "'layer0.weight' is neither weight nor bias"),
         (saved(GOOD | {"layer0.weight": HUGE}), "'layer0.weight' is larger than what the file stores"),

@@ -75,18 +75,6 @@ def test_rows_where_the_map_is_poorly_known_count_less_where_that_helps():
     assert weight[sd > 0].max() < 0.1 < weight[sd == 0].min() == 1.0
 
 
-def test_going_on_from_a_model_pulls_towards_it_not_towards_nothing(fitted):
-    x, y, of = rows(seed=5, groups=2, each=10)
-    far = fit_linear(x, y + 1000, of, features=NAMES, penalty=1e9, start=fitted.model).model
-    assert_allclose(far.coefficients_nt, fitted.model.coefficients_nt, rtol=1e-4)
-    assert far.constant_nt == pytest.approx(fitted.model.constant_nt + 1000, abs=20)
-    assert_array_equal(far.inputs.mean, fitted.model.inputs.mean)
-    with pytest.raises(
-        InputError, match="the model to continue from has inputs yaw_sin, odom_v_x, battery_v"
-    ):
-        fit_linear(x, y, of, features=("yaw_cos", "odom_v_x", "battery_v"), start=fitted.model)
-
-
 def test_a_rows_bytes_do_not_depend_on_its_neighbours_and_nan_stays_in_its_row(fitted):
     x = rows(seed=3)[0]
     x[7, 1] = np.nan
@@ -109,24 +97,3 @@ def test_a_label_that_never_varies_is_refused():
     x, _, of = rows()
     with pytest.raises(InputError, match="the label is 7 nT in every training row; there is nothing to"):
         fit_linear(x, np.full(len(x), 7.0), of, features=NAMES)
-
-
-def test_the_figures_of_its_report_are_those_of_the_raw_rows(fitted):
-    x, y, _ = rows()
-    model = fitted.model
-    figures = {figure.name: figure for figure in model.report("linear").figures}
-    slopes = np.array([figures[name].value for name in NAMES])
-    assert figures["constant"].value == pytest.approx(
-        y.mean(), rel=1e-12
-    )  # the labels' mean, at the inputs' means
-    predicted = figures["constant"].value + (x - x.mean(axis=0)) @ slopes
-    assert_allclose(model.predict(x)[0], predicted, rtol=1e-12)
-    z = (x - x.mean(axis=0)) / x.std(axis=0)
-    penalty = figures["ridge penalty"].value * len(x) * np.eye(3)
-    peer = np.linalg.solve(z.T @ z + penalty, z.T @ (y - y.mean()))
-    assert_allclose(slopes, peer / x.std(axis=0), rtol=1e-9)
-    assert figures["odom_v_x"].unit == "nT per m/s"
-    for name, size in zip(NAMES, peer, strict=True):
-        assert figures[name].note == f"{size:+.3g} nT a standard deviation"
-    at_means = model.predict(x.mean(axis=0)[None])[1][0]
-    assert figures["sd at the means"].value == pytest.approx(at_means, rel=1e-12)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_array_equal
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
@@ -39,34 +39,6 @@ def a_net(features=FULL, hidden=(8, 4), seed=0, **options):
 
 def test_the_papers_network_has_799233_parameters():
     assert a_net(hidden=TrainConfig().options["layers"]).parameters_count == 799_233
-
-
-def test_a_weights_file_has_the_rights_of_any_new_file(tmp_path):
-    a_net().save(tmp_path / "n.safetensors")
-    (tmp_path / "plain").write_bytes(b"")
-    assert (tmp_path / "n.safetensors").stat().st_mode == (tmp_path / "plain").stat().st_mode
-
-
-def test_the_metadata_name_features_with_their_units(tmp_path):
-    a_net().save(tmp_path / "n.safetensors")
-    with safe_open(tmp_path / "n.safetensors", framework="np") as file:
-        about = json.loads(file.metadata()["magtwin"])
-    assert about["features"] == list(FULL)
-    assert about["units"][:4] == ["deg", "m/s", "m/s", "m/s"]
-    assert about["residual_sd_nt"] is None
-    assert about["output_unit"] == "nT"
-
-
-def test_scalers_make_training_rows_standard_and_leave_constant_ones_alone():
-    rng = np.random.default_rng(1)
-    x = rng.normal(5, 3, (1000, 2))
-    x[:, 1] = 7.1
-    inputs = inputs_of(x, ["yaw_deg", "battery_v"])
-    z = inputs.scaled(x)
-    assert_allclose(z.mean(axis=0), 0, atol=1e-12)
-    assert_allclose(z[:, 0].std(), 1)
-    assert inputs.scale[1] == 1
-    assert_array_equal(inputs.high, x.max(axis=0))
 
 
 def test_the_released_network_converts_once_and_stays_itself(real_data, tmp_path):

@@ -120,15 +120,6 @@ def test_a_simulation_is_read_by_any_kind_and_many_as_one(lab_scene, tmp_path):
         assert_array_equal(both[1][name], one[name])
 
 
-def test_robots_that_step_together_do_not_read_the_vector_axes(lab_scene, tmp_path):
-    pytest.importorskip("gymnasium")
-    from magtwin.gym import MagNavEnv
-
-    a_predictor("hybrid", SETS["vector"]).save(tmp_path / "h.safetensors")
-    with pytest.raises(InputError, match="reads b_vector_measured_nt, which MagNav does not simulate"):
-        MagNavEnv(scene=lab_scene, network=tmp_path / "h.safetensors")
-
-
 # Files that are not what they should be
 
 
@@ -147,11 +138,7 @@ def changed(tmp_path, kind, *, about=None, drop=None, **tensors):
 @pytest.mark.parametrize(
     ("kind", "change", "text"),
     [
-        (
-            "mlp",
-            {"about": {"kind": "oracle", "format_version": 2}},
-            "no predictor kind 'oracle'",
-        ),
+        ("mlp", {"about": {"kind": "oracle", "format_version": 2}}, "no predictor kind 'oracle'"),
         ("mlp", {"about": {"kind": ["mlp"]}}, "'kind' of its metadata must be text"),
         ("linear", {"about": {"format_version": 1}}, "format version 1"),
         ("linear", {"about": {"penalty": "much"}}, "'penalty' of its metadata"),

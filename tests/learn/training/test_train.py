@@ -4,7 +4,7 @@ import torch
 from numpy.testing import assert_allclose
 
 from magtwin.errors import InputError
-from magtwin.learn.training.fit_network import Dropout, train
+from magtwin.learn.training.fit_network import train
 
 NAMES = ("yaw_deg", "odom_v_x")
 SMALL = {"features": NAMES, "layers": (32, 32), "dropout": 0.0, "batch": 256, "lr": 3e-3}
@@ -45,26 +45,6 @@ def test_one_seed_gives_one_network_and_another_seed_another():
     a, b, c = (a_training(seed, n=600, epochs=2, dropout=0.3)[0].tensors() for seed in (0, 0, 1))
     assert all(np.array_equal(a[name], b[name]) for name in a)
     assert not np.array_equal(a["layers.0.weight"], c["layers.0.weight"])
-
-
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.3, 0.9])
-def test_dropout_drops_its_share_and_scales_the_others_up(share):
-    drop = Dropout(share, torch.Generator().manual_seed(5))
-    out = torch.stack([drop(torch.ones(99, 999)) for _ in range(10)])
-    dropped = (out == 0).double()
-    sd = np.sqrt(share * (1 - share))
-    assert abs(float(dropped.mean()) - share) <= 4 * sd / np.sqrt(out.numel()) + 1e-5
-    assert_allclose(out[out != 0].numpy(), 1 / (1 - share), rtol=2e-4)  # to a 65,536th of 0.1
-    assert_allclose(dropped.mean(dim=(0, 1)).numpy(), share, atol=6 * sd / np.sqrt(990))  # no unit is spared
-    if share:
-        assert not torch.equal(out[0], out[1])
-
-
-def test_dropped_units_pass_no_gradient():
-    h = torch.ones(8, 64, requires_grad=True)
-    out = Dropout(0.5, torch.Generator().manual_seed(0))(h)
-    out.sum().backward()
-    assert torch.equal(h.grad, out.detach())
 
 
 def test_training_leaves_torchs_own_generator_as_it_was():
@@ -113,21 +93,9 @@ def test_the_network_knows_its_training_ranges():
 )
 def test_what_cannot_be_trained_on_is_refused(change, text):
     x, y = rows(50, 0)
+    given = SMALL | {"y": y, "rng": np.random.default_rng(0), "epochs": 2} | change
     with pytest.raises(InputError, match=text):
-        train(
-            **(
-                {
-                    "x": x,
-                    "y": y,
-                    "x_val": x,
-                    "y_val": y,
-                    "rng": np.random.default_rng(0),
-                    **SMALL,
-                    "epochs": 2,
-                }
-                | change
-            )
-        )
+        train(x, x_val=x, y_val=y, **given)
 
 
 def same(a, b):
@@ -150,12 +118,6 @@ def test_fine_tuning_widens_the_training_ranges_and_leaves_unknown_ones_unknown(
     net, _ = train(x + 30, y, x, y, rng=np.random.default_rng(0), init=init, **SMALL, epochs=1)
     assert_allclose(net.inputs.low, x.min(axis=0))
     assert_allclose(net.inputs.high, [x[:, 0].max() + 30, np.nan])
-
-
-def test_how_many_rows_are_done_is_told_step_by_step():
-    told = []
-    a_training(n=600, epochs=2, advance=lambda done, total: told.append((done, total)))
-    assert told == [(n, 1200) for n in (256, 512, 600, 856, 1112, 1200)]
 
 
 def test_a_network_of_other_layers_is_not_gone_on_from():

@@ -1,13 +1,7 @@
 import pytest
 
 from magtwin.errors import InputError
-from magtwin.learn.data.features import SETS
 from magtwin.learn.training.config import TrainConfig, models, read_config
-
-
-def test_what_is_not_said_is_as_the_paper_has_it():
-    config = TrainConfig()
-    assert (config.layers, config.dropout, config.inputs) == ((512,) * 4, 0.3, SETS["full"])
 
 
 def test_a_configuration_comes_back_from_its_own_toml(tmp_path):
@@ -56,10 +50,7 @@ def test_weights_to_go_on_from_lie_beside_the_file_that_names_them(tmp_path):
         ("layers = [99999, 99999]", "make 10,001,899,980 weights"),
         ('split = "day"', ":1: split must be one of"),
         ('features = "ful"', "no feature set 'ful'; did you mean 'full'"),
-        (
-            'model = "linear"\nepochs = 3',
-            ":2: epochs is no option of 'linear'; leave it out",
-        ),
+        ('model = "linear"\nepochs = 3', ":2: epochs is no option of 'linear'; leave it out"),
         ('model = "rigde"', ":1: no model 'rigde'; known: hybrid, linear"),
         ('model = "hybrid"\npenalty = -1', ":2: penalty must be between 0"),
         ('device = "gpu"', ":1: device must be one of"),
@@ -70,9 +61,3 @@ def test_a_file_that_says_what_cannot_be_is_refused(tmp_path, text, said):
     with pytest.raises(InputError) as refused:
         read_config(tmp_path / "c.toml")
     assert said in str(refused.value)
-
-
-def test_a_licence_is_kept_in_a_configuration_and_none_is_left_out():
-    assert 'licence = "MIT"' in TrainConfig(licence="MIT").to_toml()
-    assert "licence" not in TrainConfig().to_toml()
-    assert TrainConfig(licence="MIT").with_options(model="linear").licence == "MIT"

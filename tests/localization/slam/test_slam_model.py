@@ -14,8 +14,6 @@ from magtwin.localization.slam.model import Model, State
 from magtwin.localization.slam.samples import samples_of
 from magtwin.localization.slam.settings import Settings
 
-STEP = 1e-6
-
 
 def full_model(vector, odometry_axes):
     """A model with every constant and a drift, 7 samples, and a random state near them."""
@@ -38,49 +36,6 @@ def full_model(vector, odometry_axes):
         samples,
         State(samples.p_odom, tilt @ samples.R_odom, rng.normal(0, 50, (7, model.drifts)), g),
     )
-
-
-def by_differences(function, size, rows):
-    """Central differences of a function of errors with shape (rows, size), the same for all rows."""
-    columns = []
-    for j in range(size):
-        e = np.zeros((rows, size))
-        e[:, j] = STEP
-        columns.append((function(e) - function(-e)) / (2 * STEP))
-    return np.stack(columns, axis=-1)
-
-
-@pytest.mark.parametrize("vector", [True, False])
-def test_derivatives_of_readings(vector):
-    model, _, state = full_model(vector, "body")
-    zero, none = np.zeros(model.layout.count), np.zeros((7, model.size))
-    y, by_state, by_constants = model.measure(state)
-    assert_allclose(model.expected(state), y, rtol=1e-12)
-    numeric = by_differences(lambda e: model.expected(model.add(state, e, zero)), model.size, 7)
-    assert_allclose(by_state, numeric, atol=1e-4 * np.abs(numeric).max())
-    for j in range(model.layout.count):
-        e = np.eye(model.layout.count)[j]
-        up, down = (model.expected(model.add(state, none, s * e)) for s in (1, -1))
-        assert_allclose(by_constants[:, :, j], (up - down) / 2, atol=1e-6 * np.abs(y).max())
-
-
-@pytest.mark.parametrize("vector", [True, False])
-@pytest.mark.parametrize("odometry_axes", ["body", "world"])
-def test_derivatives_of_motion(vector, odometry_axes):
-    model, samples, state = full_model(vector, odometry_axes)
-    steps = model.steps(samples)
-    before = State(*[part[:-1] for part in state[:3]], state.g)
-    moved, by_state, by_constants = model.move(before, steps)
-    zero, none = np.zeros(model.layout.count), np.zeros((6, model.size))
-
-    def error(e, g):
-        return model.difference(model.move(model.add(before, e, g), steps)[0], moved)
-
-    assert_allclose(by_state, by_differences(lambda e: error(e, zero), model.size, 6), atol=1e-6)
-    for j in range(model.layout.motion.stop):
-        e = STEP * np.eye(model.layout.count)[j]
-        assert_allclose(by_constants[:, :, j], (error(none, e) - error(none, -e)) / (2 * STEP), atol=1e-6)
-    assert model.layout.motion.stop == 3
 
 
 def test_the_heading_s_variance_of_a_tilted_robot_agrees_with_draws():
