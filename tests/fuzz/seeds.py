@@ -490,6 +490,7 @@ FORMATS: Mapping[str, Format] = {
     "robot": Format("cart.usda", _robot, _read_robot, slow=True),
     "scene": Format("room.usda", _scene, _read_scene, slow=True),
     "scene-magnetics": Format("magnetics.usda", _scene, _read_scene, slow=True),
+    "ply": Format("x.ply", _mesh, _MESH),
     "stl": Format("x.stl", _mesh, _MESH),
     "stl-text": Format("ascii.stl", _mesh, _MESH),
     "glb": Format("x.glb", _mesh, _MESH),

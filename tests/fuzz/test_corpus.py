@@ -11,8 +11,7 @@ from magtwin.errors import InputError
 CORPUS = Path(__file__).with_name("corpus")
 
 OTHERS = {
-    **{kind: (kind,) for kind in ("dataset", "glb", "npz", "usdz", "xacro")},
-    "ply": ("stl", "stl-text"),
+    **{kind: (kind,) for kind in ("dataset", "glb", "npz", "ply", "usdz", "xacro")},
     "usda.glb": ("usda", "robot"),
     "usda.info": ("usda", "robot"),
     "usda.magnetics": ("scene-magnetics", "usda"),

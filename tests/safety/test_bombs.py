@@ -20,6 +20,7 @@ from one_triangle import glb
 from magtwin.errors import InputError
 from magtwin.export import usdz as usdz_format
 from magtwin.files import budget
+from magtwin.files.file import read_text
 from magtwin.files.settings import read_toml
 from magtwin.io.bags.bag import Bag
 from magtwin.io.formats import read_run
@@ -260,7 +261,12 @@ BOMBS = {
         read_mesh,
         "that decode to",
     ),
-    "solids.stl": (lambda p: p.write_text("solid\nendsolid\n" * 20_000), read_mesh, "holds no triangle"),
+    "solids.stl": (lambda p: p.write_text("solid\nendsolid\n" * 20_000), read_mesh, "solids"),
+    "count.ply": (
+        lambda p: p.write_text("ply\nformat ascii 1.0\nelement vertex 999999999\nend_header\n"),
+        read_mesh,
+        "claims",
+    ),
     "claims.stl": (lambda p: p.write_bytes(bytes(80) + b"\xff" * 4_000_000), read_mesh, "or cut short"),
     "stride.gltf": (lambda p: glb(p, {"count": 2_000_000_000}, byteStride=0), read_mesh, "that decode"),
     "length.safetensors": (
@@ -377,7 +383,7 @@ LARGE = {
     "npz": ("a.npz", read_run),
     "Parquet": ("a.parquet", read_run),
     "CSV": ("a.csv", read_run),
-    "text": ("a.csv", call("path:read_path_csv")),
+    "text": ("a.md", lambda path: read_text(path, "model card", "text")),
     "readings": ("a.csv", call("tables.table:read_table")),
     "recording": ("a.json", call("io.release:read_release")),
     "rrd": ("a.rrd", read_run),
