@@ -110,8 +110,8 @@ class Online(Input):
         self._kept.append((stamp, columns))
         if why := self._use(message, stamp, columns):
             self._unused[why] += 1
-            if why not in self._reasons:
-                self._reasons.add(why)
+            if (kind := why.partition(":")[0]) not in self._reasons:
+                self._reasons.add(kind)
                 self._say(f"{self.name}: poses {why}")
 
     def _use(self, message: Message, stamp: int, columns: Columns) -> str:

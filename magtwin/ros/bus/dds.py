@@ -36,10 +36,10 @@ from cyclonedds.topic import Topic as DdsTopic
 from magtwin.errors import InputError, RepairWarning
 from magtwin.io.bags.cdr import NS
 from magtwin.io.bags.topics import CLOCK, Qos
-from magtwin.io.bags.types import typestore
+from magtwin.io.bags.types import definition_of, typestore
 from magtwin.ros.bus.bus import Bus, Endpoint, Handler, Message, Publisher, Subscription
 from magtwin.ros.bus.clock import Alarm, Clock
-from magtwin.ros.bus.graph import Discovered, Listed, user_data
+from magtwin.ros.bus.graph import Discovered, Listed, qos_of
 from magtwin.ros.bus.names import Names, Range
 from magtwin.ros.bus.types import struct_of
 
@@ -69,18 +69,6 @@ PORTS, PORTS_EACH = 7400, 250
 
 _DOMAINS: dict[int, Domain] = {}
 """Configured domains; they must be configured before the first participant and outlive it."""
-
-
-def qos_of(qos: Qos, kind: str) -> DdsQos:
-    """DDS policies of a quality of service, for an endpoint of a message type."""
-    reliable = Policy.Reliability.Reliable(max_blocking_time=NS // 10)
-    return DdsQos(
-        reliable if qos.reliable else Policy.Reliability.BestEffort,
-        Policy.History.KeepLast(qos.depth),
-        Policy.Durability.TransientLocal if qos.latched else Policy.Durability.Volatile,
-        Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
-        user_data(kind),
-    )
 
 
 def sockets_of(domain: int) -> list[socket.socket]:
@@ -154,7 +142,9 @@ class DdsBus(Bus):
     def publisher(self, topic: str, kind: str, qos: Qos) -> Publisher:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
-        writer: DataWriter[Any] = DataWriter(self._participant, self._topic(whole, kind), qos_of(qos, kind))
+        writer: DataWriter[Any] = DataWriter(
+            self._participant, self._topic(whole, kind), qos_of(qos, definition_of(kind)[1])
+        )
         self._writers.append(writer)  # its latched message lives as long as it does
         held = weakref.proxy(writer)  # a publisher that outlives its closed bus must not keep the participant
         return Publisher(
@@ -167,7 +157,9 @@ class DdsBus(Bus):
     def subscribe(self, topic: str, kind: str, handler: Handler, qos: Qos) -> Subscription:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
-        reader: DataReader[Any] = DataReader(self._participant, self._topic(whole, kind), qos_of(qos, kind))
+        reader: DataReader[Any] = DataReader(
+            self._participant, self._topic(whole, kind), qos_of(qos, definition_of(kind)[1])
+        )
         fresh = ReadCondition(reader, SampleState.NotRead | ViewState.Any | InstanceState.Any)
         self._waiting.attach(fresh)
         self._conditions.append(fresh)

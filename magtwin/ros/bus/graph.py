@@ -16,7 +16,9 @@ from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic as DdsTopic
 
-from magtwin.io.bags.types import definition_of, store_of
+from magtwin.io.bags.cdr import NS
+from magtwin.io.bags.topics import LATCHED, Qos
+from magtwin.io.bags.types import store_of
 from magtwin.ros.bus.bus import Endpoint
 from magtwin.ros.bus.types import ros_name, struct_of
 
@@ -34,11 +36,19 @@ GID_BYTES = {"humble": 24, "jazzy": 16}
 """Size of the identifier of an endpoint in node lists, by the distribution that introduced it."""
 
 _KEY = "typehash="
+"""Before the hash of its type in the user data of an endpoint (REP 2016)."""
 
 
-def user_data(kind: str) -> Any:
-    """The user data of an endpoint: the hash of its type."""
-    return Policy.Userdata(f"{_KEY}{definition_of(kind)[1]};".encode())
+def qos_of(qos: Qos, digest: str) -> DdsQos:
+    """DDS policies of a quality of service, for an endpoint of a message type with this hash, or none."""
+    reliable = Policy.Reliability.Reliable(max_blocking_time=NS // 10)
+    return DdsQos(
+        reliable if qos.reliable else Policy.Reliability.BestEffort,
+        Policy.History.KeepLast(qos.depth),
+        Policy.Durability.TransientLocal if qos.latched else Policy.Durability.Volatile,
+        Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
+        Policy.Userdata(f"{_KEY}{digest};".encode() if digest else b""),
+    )
 
 
 def digest_of(qos: DdsQos) -> str:
@@ -127,16 +137,9 @@ class Listed:
 
     def _written_as(self, form: str) -> "DataWriter[Any]":
         store = store_of(form)
-        digest = f"{_KEY}{store.hash_rihs01(LISTS_KIND)};".encode() if form != "humble" else b""
-        qos = DdsQos(
-            Policy.Reliability.Reliable(max_blocking_time=10**8),
-            Policy.History.KeepLast(1),
-            Policy.Durability.TransientLocal,
-            Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
-            Policy.Userdata(digest),
-        )
+        digest = "" if form == "humble" else store.hash_rihs01(LISTS_KIND)
         topic: DdsTopic[Any] = DdsTopic(self._participant, LISTS, struct_of(LISTS_KIND, store))
-        return DataWriter(self._participant, topic, qos)
+        return DataWriter(self._participant, topic, qos_of(LATCHED, digest))
 
     def _entry(self, form: str) -> bytes:
         """The message on `LISTS`."""

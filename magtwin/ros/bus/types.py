@@ -57,7 +57,7 @@ def struct_of(kind: str, store: Any = None) -> type[IdlStruct]:
     return struct
 
 
-def _struct(kind: str, fields: Callable[[str], Any]) -> type[IdlStruct]:
+def _struct(kind: str, fields: Callable[[str], Any] = fields_of) -> type[IdlStruct]:
     name = dds_name(kind)
     members = {field: _member(described, fields) for field, described in fields(kind)}
     return final(make_idl_struct(name.rpartition("::")[2], name, members))
