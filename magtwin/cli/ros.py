@@ -27,7 +27,7 @@ from magtwin.cli.options import (
     Whole,
     check_pace,
 )
-from magtwin.cli.terminal import Done, announce, progress, silence
+from magtwin.cli.terminal import Done, announce, progress, silence, step
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
@@ -209,6 +209,8 @@ def magnetometer(
     lab: Lab = "",
     map_layer: MapLayer = None,
     network: Network = None,
+    online: str | None = None,
+    measured: str | None = None,
     frame_prefix: FramePrefix = None,
     duration_s: WallS = None,
 ) -> Done:
@@ -218,7 +220,7 @@ def magnetometer(
     publishes qtfm/magnitude and qtfm/total_field_nt while its inputs are fresh, and its state in
     /diagnostics. Inputs may come and go. Settings have the form of ROS, name:=value: rate_hz (135), units
     (T or nT), use_sim_time, max_age_s (0.5), battery_max_age_s (30), stamps (header, arrival), lidar (scan,
-    on, off), outside (silent, clamp).
+    on, off), outside (silent, clamp); with --online also buffer_s (60), pose_sd_m (0), map_frame (map).
 
     Parameters
     ----------
@@ -226,6 +228,13 @@ def magnetometer(
         USD stage that names the map, the network and the robot.
     settings
         Settings, such as units:=nT use_sim_time:=true.
+    online
+        Topic of late poses, by which a mixed model follows its session: PoseStamped,
+        PoseWithCovarianceStamped, TransformStamped or Odometry, whose stamps may lie some seconds in the
+        past. Readings are then published on predicted/magnitude and predicted/total_field_nt.
+    measured
+        Topic of the field that a real sensor measures, for --online: MagneticField or Float64, in T or nT.
+        Default: qtfm/magnitude.
     """
     from magtwin.ros.magnetometer import PARAMETERS, Magnetometer
     from magtwin.ros.parameters import settings as settings_of
@@ -237,7 +246,9 @@ def magnetometer(
         scene, lab=lab, map_layer=map_layer, network=network, model_error=False
     )  # it predicts for a robot that reads
     with where.bus("magtwin_magnetometer", sim_time=values["use_sim_time"], duration_s=duration_s) as bus:
-        Magnetometer(twin, bus, values, frame_prefix=frame_prefix or "", say=announce)
+        Magnetometer(
+            twin, bus, values, online=online, measured=measured, frame_prefix=frame_prefix or "", say=announce
+        )
         announce(f"reading by {bus.backend}; Ctrl-C ends")
         spin(bus, duration_s)
     return Done()
@@ -352,6 +363,60 @@ def record(
         _warn(f"{name} was not recorded: {why}")
     data = {"messages": counts, "missing": missing}
     return Done(text=text, data=data, wrote=out, status=1 if missing else 0)
+
+
+@ros_app.command(name="replay")
+def replay(
+    run: Path,
+    *,
+    topic: tuple[str, ...] = (),
+    scene: Path | None = None,
+    where: Where = HERE,
+    pace: float = 1.0,
+    stamps: Literal["run", "wall"] = "run",
+    out_unit: OutUnit = None,
+    frame_prefix: FramePrefix = None,
+    tf: Literal["all", "odom", "none"] = "odom",
+) -> Done:
+    """Publish a recorded run on its robot's ROS topics, in real time.
+
+    Parameters
+    ----------
+    run
+        A run in any format that magtwin reads.
+    topic
+        Topic to publish. May be repeated. Default: all.
+    scene
+        Scene of the run, for frames, covariances, /tf_static and the robot's description. Default: none.
+    pace
+        Seconds of the run per second.
+    stamps
+        Time of the messages and of /clock: that of the run, or wall time, for programs without use_sim_time.
+    tf
+        Transforms of the drive on /tf, as for `magtwin ros sim`.
+    """
+    from magtwin.io.formats import read_run
+    from magtwin.ros.record import Player
+    from magtwin.twin import open_twin
+
+    check_pace(pace)
+    whole = read_run(run)
+    twin = None if scene is None else open_twin(scene, model_error=False)
+    with where.bus("magtwin_replay") as bus:
+        player = Player(
+            whole,
+            bus,
+            twin,
+            units=out_unit or "T",
+            topics=topic,
+            stamps=stamps,
+            frame_prefix=frame_prefix or "",
+            tf=tf,
+        )
+        announce(f"replaying {whole['t'][-1] - whole['t'][0]:.0f} s by {bus.backend}; Ctrl-C ends")
+        step("Replaying")
+        count = player.run(speed=pace)
+    return Done(text=f"{count} messages", data={"messages": count})
 
 
 def spin(bus: "Bus", duration_s: float | None) -> None:

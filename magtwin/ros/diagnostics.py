@@ -13,6 +13,9 @@ from magtwin.ros.bus import Bus, to_bytes
 
 Level = Literal["ok", "warn", "error", "stale"]
 
+Problems = Iterable[tuple[Any, str]]
+"""Whether each problem is present, and its text."""
+
 LEVELS: Mapping[str, int] = {"ok": 0, "warn": 1, "error": 2, "stale": 3}
 """Values of levels in diagnostic_msgs/msg/DiagnosticStatus."""
 
@@ -41,7 +44,7 @@ class Status:
 
 def status_of(
     name: str,
-    problems: Iterable[tuple[Any, str]],
+    problems: Problems,
     *,
     fine: str,
     level: Level = "ok",

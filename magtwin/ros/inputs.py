@@ -15,7 +15,7 @@ from magtwin.io.bags.frames import LEAVES, Mount, Role, StaticFrames, in_base, m
 from magtwin.io.bags.topics import LATCHED, SENSOR_DATA, TF_STATIC, Topic
 from magtwin.io.bags.types import layout
 from magtwin.ros.bus import Bus, Message, Subscription
-from magtwin.ros.diagnostics import Level, Status, status_of
+from magtwin.ros.diagnostics import Level, Problems, Status, status_of
 from magtwin.spec.base import Quat
 
 Columns = dict[str, NDArray[Any]]
@@ -24,7 +24,10 @@ Stamps = Literal["header", "arrival"]
 """Time of a message: the stamp of its header, or its arrival at this node."""
 
 KEPT = 64
-"""Messages kept per topic."""
+"""Messages kept per topic, beside those of its history."""
+
+MOST_KEPT = 50_000
+"""Most messages kept per topic."""
 
 JUMP_S = 1.0
 """A stamp older than the last one by more than this means a restart of the robot or the clock [s]."""
@@ -92,6 +95,9 @@ class LiveFrames:
 class Input:
     """A topic, subscribed to when it is first published, in any of its readable types."""
 
+    qos = SENSOR_DATA
+    """QoS of the subscription."""
+
     def __init__(
         self,
         bus: Bus,
@@ -101,6 +107,7 @@ class Input:
         max_age_s: float,
         wanted: frozenset[str] | None = None,
         stamps: Stamps = "header",
+        history_s: float = 0.0,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Start to search for it.
@@ -112,6 +119,7 @@ class Input:
             max_age_s: Age at which its newest message is stale [s].
             wanted: Columns that must be valid. Default: all.
             stamps: Time of its messages.
+            history_s: Time for which messages are kept [s], to be joined with a time that long ago.
             say: Called with messages for the user.
         """
         self.topic, self.max_age_s, self._bus, self._wanted = topic, max_age_s, bus, wanted
@@ -120,7 +128,8 @@ class Input:
         """Its name on the network."""
         self._kind = ""
         self._subscription: Subscription | None = None
-        self._kept: deque[tuple[int, Columns]] = deque(maxlen=KEPT)
+        self._kept: deque[tuple[int, Columns]] = deque(maxlen=MOST_KEPT)
+        self._history_ns = round(history_s * NS)
         self.heard, self.broken, self.jumps, self.ahead = 0, 0, 0, 0
         self.sent_ns = 0
         self._heard_before, self._reported_ns = 0, 0
@@ -142,7 +151,7 @@ class Input:
         elif known:
             self._trouble = ""
             self._kind = known[0]
-            self._subscription = self._bus.subscribe(self.topic.name, self._kind, self._hear, SENSOR_DATA)
+            self._subscription = self._bus.subscribe(self.topic.name, self._kind, self._hear, self.qos)
         elif kinds:
             self._trouble = f"published as {', '.join(kinds)}; readable: {', '.join(self.topic.reads)}"
 
@@ -207,6 +216,7 @@ class Input:
         elif latest[1] > self.max_age_s:
             stale = f"its newest is {latest[1]:.2f} s old, more than {self.max_age_s:g} s"
         expected = bool(stale and self.silence and not self._trouble)
+        more, told = self._more(now_ns)
         problems = (
             (bool(self._trouble and self._subscription), self._trouble),
             (bool(self._fault), self._fault),
@@ -215,6 +225,7 @@ class Input:
             (bool(self.jumps), f"stamps jumped back {self.jumps} times"),
             (bool(self.ahead), f"{self.ahead} stamps were ahead of this node's clock"),
             (bool(self._clock()), self._clock()),
+            *more,
         )
         values = {
             "topic": self.name,
@@ -222,12 +233,17 @@ class Input:
             "age [s]": "" if latest is None else f"{latest[1]:.3f}",
             "rate [Hz]": f"{rate:.1f}",
             "publishers": str(senders),
+            **told,
         }
         self.broken = self.jumps = self.ahead = 0
         words = [self.silence if expected else stale] if stale else []
         level: Level = "stale" if stale and not expected else "ok"
         name = f"input {self.name}"
         return status_of(name, problems, fine="fresh", level=level, words=words, values=values)
+
+    def _more(self, now_ns: int) -> tuple[Problems, dict[str, str]]:
+        """Further problems since the previous call, and values."""
+        return (), {}
 
     def _hear(self, message: Message) -> None:
         self.heard += 1
@@ -242,6 +258,10 @@ class Input:
             if not (unit and np.isfinite(columns[name]).all()):
                 self.broken += 1
                 return
+        self._take(message, stamp, columns)
+
+    def _take(self, message: Message, stamp: int, columns: Columns) -> None:
+        """Use a valid message."""
         now = self._bus.now_ns()
         self._compare(now, stamp, message)
         if now and stamp > now + AHEAD_S * NS:  # before the first /clock, all stamps are ahead
@@ -255,6 +275,8 @@ class Input:
         if self._kept and stamp == self._kept[-1][0]:
             self._kept.pop()
         self._kept.append((stamp, columns))
+        while len(self._kept) > KEPT and self._kept[1][0] < stamp - self._history_ns:
+            self._kept.popleft()
 
     def _compare(self, now: int, stamp: int, message: Message) -> None:
         """Compare a stamp with the node's clock; reports a large difference once."""
@@ -319,11 +341,19 @@ class Gravity:
 class Scanning:
     """Whether a LiDAR spins: it does while scans arrive."""
 
-    def __init__(self, bus: Bus, topic: Topic, *, gap_s: float) -> None:
-        """Start to search for scans; `gap_s` is the longest time between two while it spins [s]."""
+    def __init__(self, bus: Bus, topic: Topic, *, gap_s: float, history_s: float = 0.0) -> None:
+        """Start to search for scans.
+
+        Args:
+            bus: The node.
+            topic: Their topic.
+            gap_s: Longest time between two while it spins [s].
+            history_s: As for `Input`.
+        """
         self._bus, self._topic, self._gap_s = bus, topic, gap_s
         self._subscription: Subscription | None = None
-        self._last_ns: int | None = None
+        self._times_ns: deque[int] = deque(maxlen=MOST_KEPT)
+        self._kept_ns = round((history_s + gap_s) * NS)
         self.heard = 0
 
     def look(self) -> None:
@@ -334,11 +364,12 @@ class Scanning:
 
     def on(self, now_ns: int) -> bool:
         """Whether it spins at a time [ns]."""
-        return self._last_ns is not None and 0 <= now_ns - self._last_ns < self._gap_s * NS
+        last = next((t_ns for t_ns in reversed(self._times_ns) if t_ns <= now_ns), None)
+        return last is not None and now_ns - last < self._gap_s * NS
 
     def forget(self) -> None:
         """As for `Input`."""
-        self._last_ns = None
+        self._times_ns.clear()
 
     def status(self, now_ns: int) -> Status:
         """As for `Input`; silence means that it does not spin, so it is never stale."""
@@ -347,4 +378,6 @@ class Scanning:
 
     def _hear(self, message: Message) -> None:
         self.heard += 1
-        self._last_ns = self._bus.now_ns()
+        self._times_ns.append(self._bus.now_ns())
+        while self._times_ns[0] < self._times_ns[-1] - self._kept_ns:
+            self._times_ns.popleft()

@@ -7,7 +7,8 @@ what is missing, and resumes when that is back.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,7 @@ from magtwin.io.bags.topics import BATTERY, COMMAND, IMU, MAGNITUDE, ODOMETRY, P
 from magtwin.ros.bus import Bus, to_bytes
 from magtwin.ros.bus.names import checked_prefix
 from magtwin.ros.diagnostics import Status
-from magtwin.ros.inputs import Columns
+from magtwin.ros.inputs import Columns, Input
 from magtwin.ros.node import BACK_S, Node
 from magtwin.ros.parameters import Parameter
 from magtwin.ros.topics import TOTAL_FIELD
@@ -30,6 +31,7 @@ from magtwin.ros.topics import TOTAL_FIELD
 if TYPE_CHECKING:
     from magtwin.learn.inference.reader import Reader, Reading
     from magtwin.learn.models.predictor import Predictor
+    from magtwin.ros.online import Online
     from magtwin.twin import Twin
 
 PARAMETERS: Mapping[str, Parameter] = MappingProxyType(
@@ -52,6 +54,11 @@ PARAMETERS: Mapping[str, Parameter] = MappingProxyType(
         "outside": Parameter(
             "silent", "outside the map: no reading, or the reading at its border", words=("silent", "clamp")
         ),
+        "buffer_s": Parameter(60.0, "age at which a late pose is too old to be used [s]", 1.0, 300.0),
+        "pose_sd_m": Parameter(
+            0.0, "standard deviation of late positions without a covariance, each axis [m]", 0.0, 10.0
+        ),
+        "map_frame": Parameter("map", "frame of the map, in the headers of late poses"),
     }
 )
 """Parameters of the node."""
@@ -75,6 +82,8 @@ class Magnetometer:
         bus: Bus,
         settings: Mapping[str, Any],
         *,
+        online: str | None = None,
+        measured: str | None = None,
         frame_prefix: str = "",
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
@@ -84,11 +93,15 @@ class Magnetometer:
             twin: Gives map, network and the sensor's frame.
             bus: The node, whose clock follows `use_sim_time`.
             settings: Values of `PARAMETERS`.
+            online: Topic of late poses by which a mixed model follows its session. Readings are then
+                published on predicted/magnitude and predicted/total_field_nt.
+            measured: Topic of the field that a real sensor measures. Default: qtfm/magnitude.
             frame_prefix: Prefix of the names of frames, such as "tb4/".
             say: Called with messages for the user.
 
         Raises:
             InputError: The scene's magnetometer is physical, or its network reads columns that no input has.
+                With `online`: the model is of another kind, or a name is not that of a topic.
         """
         robot = twin.scene.robot
         if twin.magnetometer is None and robot.magnetometer.kind != "map-only":
@@ -105,24 +118,56 @@ class Magnetometer:
         self.latencies_s = self._node.latencies_s
         """Latency of the last readings [s], from when the step was due or its newest input was sent."""
         columns = twin.magnetometer.columns if twin.magnetometer else frozenset()
-        self._listen(columns - MADE)
+        history_s = 0.0 if online is None else settings["buffer_s"]
+        self._listen(columns - MADE, history_s)
         if "lidar_on" in columns and settings["lidar"] == "scan":
-            self._node.listen_to_scans(robot.lidar)
-        self._outputs = [
-            (bus.publisher(topic.name, topic.kind, topic.qos), topic) for topic in (MAGNITUDE, TOTAL_FIELD)
-        ]
+            self._node.listen_to_scans(robot.lidar, history_s)
+        outputs = [MAGNITUDE, TOTAL_FIELD]
+        if online is not None:  # the other names are the real sensor's
+            outputs = [replace(topic, name=topic.name.replace("/qtfm/", "/predicted/")) for topic in outputs]
+        self._outputs = [(bus.publisher(topic.name, topic.kind, topic.qos), topic) for topic in outputs]
         self._last_ns, self._begun_ns = 0, 0
         self._outside, self._strange = 0, 0
         self._reader: Reader | None = None  # None: the map alone
         self._pose_late_ns = 0
         if twin.magnetometer is not None:
             self._reader, self._pose_late_ns = _reader_of(twin.magnetometer.net, twin.field)
+        self.online = self._followed(online, measured)
+        """The session that a mixed model follows."""
         if settings["units"] == "nT":
             say("fields are published in nT, as APRILab's robot does; ROS means tesla")
         bus.timer(1 / settings["rate_hz"], self._read)
         self._node.begin()
 
-    def _listen(self, needed: frozenset[str]) -> None:
+    def _followed(self, poses: str | None, measured: str | None) -> "Online | None":
+        """The session, followed by late poses."""
+        if poses is None and measured is not None:
+            raise InputError("`measured` is of use only with `online`, the topic of late poses")
+        if poses is None:
+            return None
+        from magtwin.ros.online import Online
+
+        if self._twin.magnetometer is None:
+            raise InputError(
+                "`online` follows the session of a mixed model, and this magnetometer has no network"
+            )
+        measured = measured or MAGNITUDE.name
+        if self._bus.resolve(measured) in [publisher.topic for publisher, _ in self._outputs]:
+            raise InputError(
+                f"`measured={measured}` is published by this node; name the topic of a real sensor"
+            )
+        return Online(
+            self._node,
+            self._twin.magnetometer.net,
+            self._twin.field,
+            self._settings,
+            poses=poses,
+            measured=measured,
+            seconds=self._seconds,
+            signals=self._signals_then,
+        )
+
+    def _listen(self, needed: frozenset[str], history_s: float) -> None:
         """Subscribe to the inputs that have the columns of the network."""
         if beyond := sorted(needed - {column for topic in INPUTS for column in topic.needs}):
             raise InputError(
@@ -132,7 +177,7 @@ class Magnetometer:
         for topic in INPUTS:
             if topic is POSE or needed & set(topic.needs):
                 age = self._settings["battery_max_age_s" if topic is BATTERY else "max_age_s"]
-                source = self._node.listen(topic, max_age_s=age, wanted=read | _ALWAYS)
+                source = self._node.listen(topic, max_age_s=age, wanted=read | _ALWAYS, history_s=history_s)
                 if topic is COMMAND:
                     source.silence = "no commands: the robot is assumed to stand"
 
@@ -147,7 +192,7 @@ class Magnetometer:
             self._last_ns, self._begun_ns = 0, 0
         if now == self._last_ns or not now:
             return
-        columns = self._joined(now)
+        columns = self._joined(now, self.inputs.values())
         if isinstance(columns, str):
             self._skip(columns)
             return
@@ -187,19 +232,35 @@ class Magnetometer:
         if self._reader is None:
             b_map = self._twin.field.at(x, y, yaw, outside=outside)
             return Reading(b_map, b_map, 0.0, self._noise_nt, outside_training=False)
-        lidar, scans = self._settings["lidar"], self._node.scans
-        spins = lidar == "on" or (scans is not None and scans.on(now))
-        self._begun_ns = self._begun_ns or now  # stands for when the robot was switched on
-        signals: dict[str, Any] = {name: column[0] for name, column in columns.items()}
-        signals |= {"t": (now - self._begun_ns) / NS, "lidar_on": float(spins)}
-        reading = self._reader.read((x, y), yaw, signals, outside=outside)
+        signals = self._signals(now, columns)
+        if self.online is not None:
+            reading = self.online.magnetometer.read(signals["t"], (x, y), yaw, signals, outside=outside)
+        else:
+            reading = self._reader.read((x, y), yaw, signals, outside=outside)
         sd = reading.b_sd_nt
         return reading._replace(b_sd_nt=float(np.hypot(sd, self._noise_nt)) if np.isfinite(sd) else 0.0)
 
-    def _joined(self, at_ns: int) -> Columns | str:
-        """Columns of the inputs at a time, or what is missing."""
+    def _seconds(self, at_ns: int) -> float:
+        """Time since the first reading [s], which stands for the time since the robot was switched on."""
+        self._begun_ns = self._begun_ns or at_ns
+        return (at_ns - self._begun_ns) / NS
+
+    def _signals(self, at_ns: int, columns: Columns) -> dict[str, Any]:
+        """Signals of the network: one row of the columns, the time, and whether the LiDAR spins."""
+        scans = self._node.scans
+        spins = self._settings["lidar"] == "on" or (scans is not None and scans.on(at_ns))
+        signals: dict[str, Any] = {name: column[0] for name, column in columns.items()}
+        return signals | {"t": self._seconds(at_ns), "lidar_on": float(spins)}
+
+    def _signals_then(self, at_ns: int) -> dict[str, Any] | str:
+        """Signals at an earlier time, or what is missing."""
+        columns = self._joined(at_ns, (s for s in self.inputs.values() if s.topic is not POSE))
+        return columns if isinstance(columns, str) else self._signals(at_ns, columns)
+
+    def _joined(self, at_ns: int, sources: Iterable[Input]) -> Columns | str:
+        """Columns of some inputs at a time, or what is missing."""
         columns: Columns = {}
-        for source in self.inputs.values():
+        for source in sources:
             fresh = source.fresh(at_ns - self._pose_late_ns if source.topic is POSE else at_ns)
             if fresh is None and source.topic is COMMAND:
                 fresh = {"v_cmd": np.zeros(1), "w_cmd": np.zeros(1)}  # a robot without commands stands

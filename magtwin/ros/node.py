@@ -10,12 +10,10 @@ import numpy as np
 from magtwin.io.bags.cdr import NS
 from magtwin.io.bags.topics import SCAN, Topic
 from magtwin.ros.bus import Bus
-from magtwin.ros.diagnostics import Level, Reporter, Status, status_of
+from magtwin.ros.diagnostics import Level, Problems, Reporter, Status, status_of
 from magtwin.ros.inputs import Input, LiveFrames, Scanning, Stamps
 from magtwin.spec.base import Quat
 from magtwin.spec.sensors import LidarSpec
-
-Problems = tuple[tuple[Any, str], ...]
 
 LOOK_S = 0.5
 """Time between searches for new topics [s]."""
@@ -45,6 +43,9 @@ class Node:
     """As for `LiveFrames`."""
 
     inputs: dict[str, Input] = field(default_factory=dict)
+    late: list[Input] = field(default_factory=list)
+    """Inputs that are not joined with the present."""
+
     scans: Scanning | None = None
     missing: str = ""
     """What the node lacks to do its work; "" if nothing."""
@@ -72,9 +73,10 @@ class Node:
         self.inputs[topic.name] = Input(self.bus, topic, max_age_s=max_age_s, **told)
         return self.inputs[topic.name]
 
-    def listen_to_scans(self, lidar: LidarSpec) -> Scanning:
+    def listen_to_scans(self, lidar: LidarSpec, history_s: float = 0.0) -> Scanning:
         """Find out from scans whether the LiDAR spins."""
-        self.scans = Scanning(self.bus, SCAN, gap_s=lidar.latency_s + 2.5 / max(lidar.scan_rate_hz, 0.1))
+        gap_s = lidar.latency_s + 2.5 / max(lidar.scan_rate_hz, 0.1)
+        self.scans = Scanning(self.bus, SCAN, gap_s=gap_s, history_s=history_s)
         return self.scans
 
     def begin(self) -> None:
@@ -106,7 +108,7 @@ class Node:
         name: str,
         doing: str,
         silent: str,
-        problems: tuple[tuple[Any, str], ...],
+        problems: Problems,
         values: dict[str, str],
     ) -> Status:
         """The state of the node's work: an error if it is `silent`, with the reason."""
@@ -133,4 +135,4 @@ class Node:
 
     def _sources(self) -> "list[Input | Scanning]":
         scans = [] if self.scans is None else [self.scans]
-        return [*self.inputs.values(), *scans]
+        return [*self.inputs.values(), *self.late, *scans]

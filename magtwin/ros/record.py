@@ -1,15 +1,25 @@
-"""Record topics to a bag, which is a run."""
+"""Record topics to a bag, which is a run; replay a run to topics."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
+from typing import Literal
 
 from magtwin.errors import InputError
 from magtwin.io.bags import RawBagWriter
+from magtwin.io.bags.cdr import NS, encode
+from magtwin.io.bags.sender import Transforms, Unit, prefixed
+from magtwin.io.bags.stream import Stream
 from magtwin.io.bags.topics import Qos
+from magtwin.io.bags.twin_sender import sender_for
+from magtwin.io.bags.types import layout
 from magtwin.ros.bus import Bus, Message
-from magtwin.ros.topics import RECORDED, TICKS
+from magtwin.ros.bus.names import checked_prefix
+from magtwin.ros.topics import READ, RECORDED, SAMPLED, TICKS
+from magtwin.run.run import Run
+from magtwin.twin import Twin
 
 FLUSH_S = 1.0
 """Wall time between flushes [s]."""
@@ -19,6 +29,12 @@ LOOK_S = 0.5
 
 DEPTH = 1000
 """Queue of a topic, so that no message is lost while a file is written."""
+
+SETTLE_S = 1.5
+"""Wall time for discovery before the first message [s]."""
+
+AT_A_TIME = 1024
+"""Rows of a run that are encoded at a time."""
 
 
 class Recorder:
@@ -131,3 +147,67 @@ class Recorder:
             before, self._clock_ns = self._clock_ns, int(message.read(["clock"])["clock"])
             return self._clock_ns < before
         return False
+
+
+class Player:
+    """Publishes a run as its robot would have."""
+
+    def __init__(
+        self,
+        run: Run,
+        bus: Bus,
+        twin: Twin | None = None,
+        *,
+        units: Unit = "T",
+        topics: Sequence[str] = (),
+        stamps: Literal["run", "wall"] = "run",
+        frame_prefix: str = "",
+        tf: Transforms = "odom",
+    ) -> None:
+        """Advertise its topics.
+
+        Args:
+            run: The run.
+            bus: The node.
+            twin: The twin of the run: gives frames, covariances, /tf_static and the robot's description.
+            units: Unit of magnetic fields.
+            topics: Names of topics to publish. Default: all.
+            stamps: Time of the messages and of /clock: that of the run, or wall time.
+            frame_prefix: Prefix of the names of frames, such as "tb4/".
+            tf: Transforms of the drive on /tf, as for `magtwin.ros.simulate.Simulator`.
+
+        Raises:
+            InputError: The run has no column of these topics.
+        """
+        self._run, self._bus, self._wall = run, bus, stamps == "wall"
+        sender = sender_for(twin, units, run.metadata.get("rate_hz"))
+        sender = replace(prefixed(sender, checked_prefix(frame_prefix)), transforms=tf)
+        self._stream = Stream(run, sender, None, topics=(*SAMPLED.values(), *READ), whole=True)
+        chosen = [t for t in self._stream.topics if bus.knows(t.kind) and (not topics or t.name in topics)]
+        if not chosen:
+            raise InputError(f"the run has no columns of {', '.join(topics) or 'any topic'}")
+        self._publishers = {t.name: bus.publisher(t.name, t.kind, t.qos) for t in chosen}
+        self._begun = time.monotonic()
+
+    def run(self, until: Callable[[], bool] = lambda: False, *, speed: float = 1.0) -> int:
+        """Publish it at `speed` times real time, after `SETTLE_S`; returns the number of messages."""
+        first, count = round(self._run["t"][0] * NS), 0
+        begin = max(time.monotonic(), self._begun + SETTLE_S)
+        # at a pace other than 1, stamps run at that pace from the wall time of the beginning
+        later = time.time_ns() + round((begin - time.monotonic()) * NS) - first if self._wall else 0
+        for row in range(0, self._run.rows, AT_A_TIME):
+            messages: list[tuple[int, str, bytes]] = []
+            for topic, times, fields in self._stream.messages(self._run.take(slice(row, row + AT_A_TIME))):
+                if topic.name in self._publishers and len(times):
+                    stamped = {n: fields[n] + later for n in fields if n.endswith(("stamp", "clock"))}
+                    data = encode(layout(topic.kind, fields), fields | stamped, len(times))
+                    sent = zip(times.tolist(), data, strict=True)
+                    messages += [(t, topic.name, one.tobytes()) for t, one in sent]
+            for t, name, one in sorted(messages, key=lambda message: message[0]):
+                while (left := begin + (t - first) / NS / speed - time.monotonic()) > 0:
+                    self._bus.spin_once(left)
+                if until():
+                    return count
+                self._publishers[name].publish(one)
+                count += 1
+        return count

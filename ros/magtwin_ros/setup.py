@@ -2,7 +2,7 @@
 
 from setuptools import setup
 
-NODES = ("sim", "magnetometer", "localize", "follow", "record")
+NODES = ("sim", "magnetometer", "localize", "follow", "record", "replay")
 
 setup(
     name="magtwin_ros",

@@ -16,7 +16,7 @@ from places import ROOT
 
 from magtwin.errors import InputError
 from magtwin.io.bags.topics import LATCHED, ODOMETRY, SENSOR_DATA, TOPICS, Qos
-from magtwin.io.bags.types import definition_of, layout
+from magtwin.io.bags.types import definition_of, layout, store_of
 from magtwin.ros.bus import Bus, Message, names_of, open_bus, to_bytes
 from magtwin.ros.bus.clock import Clock
 from magtwin.ros.bus.names import Range, range_of
@@ -281,6 +281,46 @@ def test_endpoints_carry_the_hash_of_their_type(pair: tuple[Bus, Bus]) -> None:
     assert other.wants("odom")[0].digest == definition_of(ODOMETRY.kind)[1]
 
 
+@pytest.mark.parametrize("form", ["humble", "jazzy"])
+def test_a_node_is_listed_in_the_form_of_its_peers_and_not_among_both_forms(domain: int, form: str) -> None:
+    from cyclonedds.core import Policy
+    from cyclonedds.core import Qos as DdsQos
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.sub import DataReader
+    from cyclonedds.topic import Topic
+
+    from magtwin.ros.bus.graph import LISTS, LISTS_KIND
+    from magtwin.ros.bus.types import struct_of
+
+    def peer(bus: Bus, of: str) -> tuple[object, DataReader]:
+        """A node of a distribution, as its middleware announces it."""
+        store = store_of(of)
+        digest = b"" if of == "humble" else f"typehash={store.hash_rihs01(LISTS_KIND)};".encode()
+        qos = DdsQos(Policy.Reliability.Reliable(10**8), Policy.Durability.TransientLocal)
+        topic = Topic(bus._participant, LISTS, struct_of(LISTS_KIND, store))  # type: ignore[attr-defined]
+        writer = DataWriter(bus._participant, topic, qos + DdsQos(Policy.Userdata(digest)))  # type: ignore[attr-defined]
+        return writer, DataReader(bus._participant, topic, qos)  # type: ignore[attr-defined]
+
+    node, other, third = (
+        open_bus(n, backend="cyclonedds", domain=domain) for n in ("node", "other", "third")
+    )
+    node.publisher("field", FIELD, Qos())
+    writer, reader = peer(other, form)
+    heard: list[bytes] = []
+    spin(lambda: heard.extend(sample.cdr for sample in reader.take(10)) or heard, node)
+    entry = store_of(form).deserialize_cdr(heard[-1], LISTS_KIND)
+    (listed,) = entry.node_entities_info_seq
+    assert (listed.node_namespace, listed.node_name) == ("/robot", "node")
+    assert bytes(entry.gid.data)[:16] == node._participant.guid.bytes  # type: ignore[attr-defined]
+    assert [bytes(gid.data)[:16] for gid in listed.writer_gid_seq] == [w.guid.bytes for w in node._writers]  # type: ignore[attr-defined]
+    assert {len(gid.data) for gid in listed.writer_gid_seq} == {24 if form == "humble" else 16}
+    kept = peer(third, "jazzy" if form == "humble" else "humble")
+    spin(lambda: node._listed._writer is None, node)
+    for bus in (node, other, third):
+        bus.close()
+    del writer, kept
+
+
 @pytest.fixture(scope="module")
 def jazzy() -> Path:
     """A Python with rclpy of Jazzy's wheels, whose environment is built apart."""
@@ -339,13 +379,15 @@ for kind in ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"):
 last = time.monotonic() + 120
 while time.monotonic() < last:
     node.spin_once(0.05)
-    if len(heard) == 2:
+    names = node._node.get_node_names_and_namespaces()
+    if len(heard) == 2 and ("one", "/robot") in names:
         break
-print(json.dumps([sorted(heard), {end.kind: end.digest for end in node.offers("cmd_vel")}]))
+names = [name for name, _ in names]
+print(json.dumps([sorted(heard), names, {end.kind: end.digest for end in node.offers("cmd_vel")}]))
 """
 
 
-def test_rclpy_takes_both_types_of_commands(jazzy: Path, domain: int) -> None:
+def test_rclpy_takes_both_types_of_commands_and_lists_nodes_of_cyclonedds(jazzy: Path, domain: int) -> None:
     env = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
     peer = subprocess.Popen([jazzy, "-c", BOTH, str(ROOT)], env=env, stdout=subprocess.PIPE, text=True)
     node = open_bus("one", backend="cyclonedds", domain=domain)
@@ -356,9 +398,10 @@ def test_rclpy_takes_both_types_of_commands(jazzy: Path, domain: int) -> None:
             for publisher in sent:
                 publisher.publish(to_bytes(publisher.kind, {}))
             node.spin_once(0.05)
-        heard, digests = json.loads(peer.communicate()[0])
+        heard, names, digests = json.loads(peer.communicate()[0])
     finally:
         peer.kill()
         node.close()
     assert heard == kinds
+    assert "one" in names
     assert digests == {kind: definition_of(kind)[1] for kind in kinds}

@@ -13,7 +13,7 @@ from places import ROOT
 from magtwin.ros.magnetometer import PARAMETERS
 
 PACKAGE = ROOT / "ros" / "magtwin_ros"
-NODES = ("sim", "magnetometer", "localize", "follow", "record")
+NODES = ("sim", "magnetometer", "localize", "follow", "record", "replay")
 
 
 @pytest.fixture
@@ -57,7 +57,12 @@ def arguments(monkeypatch: pytest.MonkeyPatch):
             "figure8 --ros-args -p discovery:=subnet -p domain:= -p laps:=2",
             "ros follow figure8 --discovery=subnet --laps=2",
         ),
-        ("record", "a.mcap --ros-args -r x:__ns:=/", "ros record a.mcap --namespace="),
+        ("replay", "a.mcap --ros-args -p use_sim_time:=true -r x:__ns:=/", "ros replay a.mcap --namespace="),
+        (
+            "magnetometer",
+            "lab.usda --ros-args -p online:=/slam/pose -p measured:=qtfm/magnitude -p map_frame:=world",
+            "ros magnetometer lab.usda --online=/slam/pose --measured=qtfm/magnitude map_frame:=world",
+        ),
     ],
 )
 def test_what_ros_says_of_a_node_is_a_command_of_magtwin(arguments, node, given, wanted) -> None:

@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from nodes import SLOWEST_S
+from nodes import SLOWEST_S, spin
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from magtwin.errors import InputError
 from magtwin.io.bags import RawBagWriter
-from magtwin.io.bags.topics import LATCHED, MAGNITUDE, ODOMETRY, Qos
+from magtwin.io.bags.topics import CLOCK, LATCHED, MAGNITUDE, ODOMETRY, Qos
 from magtwin.io.bags.types import definition_of
 from magtwin.io.formats import read_run
-from magtwin.ros.bus import Bus, to_bytes
-from magtwin.ros.record import Recorder
+from magtwin.ros.bus import Bus, Message, to_bytes
+from magtwin.ros.record import Player, Recorder
 from magtwin.ros.simulate import Simulator
 from magtwin.twin import Twin
 
@@ -150,6 +150,26 @@ def test_a_recording_ends_where_time_jumps_back(
     assert recorder.ended
     assert ["jumped back" in line for line in lines] == [True]
     assert read_run(tmp_path / "drive.mcap")["t"][-1] > 0.9
+
+
+def test_a_replay_by_the_wall_has_stamps_and_clock_of_now(
+    twin: Twin, nodes: Callable[..., Bus], tmp_path: Path
+) -> None:
+    from magtwin.twin import simulate
+
+    run = simulate(twin, "sine", duration_s=1.5, seed=1)
+    heard: dict[str, list[Message]] = {ODOMETRY.name: [], CLOCK.name: []}
+    player, ear = Player(run, nodes("player"), stamps="wall"), nodes("ear")
+    for topic in (ODOMETRY, CLOCK):
+        ear.subscribe(topic.name, topic.kind, heard[topic.name].append, Qos(depth=1000))
+    played = threading.Thread(target=player.run)
+    played.start()
+    spin(lambda: not played.is_alive(), ear)
+    ear.spin_once(0.1)
+    for name, leaf in ((ODOMETRY.name, "header.stamp"), (CLOCK.name, "clock")):
+        late = np.array([m.sent_ns - m.read([leaf])[leaf] for m in heard[name]]) * 1e-9
+        assert len(late) > 50
+        assert np.median(np.abs(late)) < 0.1
 
 
 def test_topics_that_are_named_are_recorded_beside_those_of_the_drive(

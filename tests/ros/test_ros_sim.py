@@ -21,7 +21,7 @@ from magtwin.io.formats import read_run
 from magtwin.ros.bus import Bus, Message, to_bytes
 from magtwin.ros.commands import command_bytes
 from magtwin.ros.diagnostics import KIND, Status, to_fields
-from magtwin.ros.record import Recorder
+from magtwin.ros.record import Player, Recorder
 from magtwin.ros.simulate import RESET, Simulator
 from magtwin.run.run import Run
 from magtwin.sim.runs.simulate import simulate
@@ -242,6 +242,26 @@ def test_diagnostics_say_what_they_were_given() -> None:
     message = Message(KIND, to_bytes(KIND, to_fields(said, 7, "robot")), 0, 0)
     assert from_message(message) == said
     assert message.read(["header.stamp"])["header.stamp"] == 7
+
+
+def test_a_run_is_said_again_as_its_robot_said_it(
+    driven: Driven, nodes: Callable[..., Bus], tmp_path: Path
+) -> None:
+    part = driven.run.between(1.0, 2.0)
+    player = Player(part, nodes("player"))
+    listener = nodes("recorder")
+    writer = RawBagWriter(tmp_path / "again.mcap")
+    recorder = Recorder(listener, writer)
+    said = threading.Thread(target=player.run, kwargs={"speed": 2.0})
+    said.start()
+    recorder.run(lambda: not said.is_alive())
+    recorder.run(duration_s=0.2)
+    writer.close()
+    again = read_run(tmp_path / "again.mcap")
+    assert again.rows == part.rows
+    for name in ("t", "b_measured_nt", "odom_p", "imu_w", "p_world_base"):
+        np.testing.assert_allclose(again[name], part[name], rtol=1e-12, err_msg=name)
+    assert again.metadata == part.metadata
 
 
 def test_a_recording_of_nothing_leaves_nothing(nodes: Callable[..., Bus], tmp_path: Path) -> None:

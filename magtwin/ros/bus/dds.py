@@ -1,8 +1,8 @@
 """DdsBus: a node over cyclonedds, which reaches any ROS 2 on the network from any Python.
 
 It follows the mapping of ROS 2: `/robot/odom` is the DDS topic `rt/robot/odom`, QoS profiles are DDS
-policies, and messages are plain CDR. Such a node sends and receives like any other, but has no services and
-is not in the lists of `ros2 node list`.
+policies, and messages are plain CDR. Such a node sends and receives like any other and is in the lists of
+`ros2 node list`, but has no services.
 """
 
 import os
@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
+from cyclonedds.builtin import BuiltinTopicDcpsSubscription
 from cyclonedds.core import (
     DDSException,
     InstanceState,
@@ -39,11 +39,12 @@ from magtwin.io.bags.topics import CLOCK, Qos
 from magtwin.io.bags.types import definition_of, typestore
 from magtwin.ros.bus.bus import Bus, Endpoint, Handler, Message, Publisher, Subscription
 from magtwin.ros.bus.clock import Alarm, Clock
+from magtwin.ros.bus.graph import Discovered, Listed, qos_of
 from magtwin.ros.bus.names import Names, Range
-from magtwin.ros.bus.types import raw, ros_name, struct_of
+from magtwin.ros.bus.types import struct_of
 
 MOST_TAKEN = 256
-"""Messages of a topic, or endpoints, taken at a time."""
+"""Messages of a topic taken at a time."""
 
 CLOCK_DEPTH = 1000
 """Queue of /clock, so that each other message gets the time before it."""
@@ -68,62 +69,6 @@ PORTS, PORTS_EACH = 7400, 250
 
 _DOMAINS: dict[int, Domain] = {}
 """Configured domains; they must be configured before the first participant and outlive it."""
-
-
-_KEY = "typehash="
-"""Before the hash of its type in the user data of an endpoint (REP 2016)."""
-
-
-def user_data(kind: str) -> Any:
-    """The user data of an endpoint: the hash of its type."""
-    return Policy.Userdata(f"{_KEY}{definition_of(kind)[1]};".encode())
-
-
-def digest_of(qos: DdsQos) -> str:
-    """The hash of the type of an endpoint, from its user data; "" if it has none, as in Humble."""
-    data = qos[Policy.Userdata].data if Policy.Userdata in qos else b""
-    entries = bytes(data).decode(errors="replace").split(";")
-    return next((entry.removeprefix(_KEY) for entry in entries if entry.startswith(_KEY)), "")
-
-
-class Discovered:
-    """The discovered publishers, or subscribers, of all topics."""
-
-    def __init__(self, participant: DomainParticipant, builtin: Any = BuiltinTopicDcpsPublication) -> None:
-        """Start to listen to DDS discovery."""
-        self._reader = BuiltinDataReader(participant, builtin)
-        self._found: dict[Any, tuple[str, Endpoint]] = {}
-
-    def of(self, topic: str) -> list[Endpoint]:
-        """The endpoints of a topic, by its DDS name."""
-        while taken := self._reader.take(N=MOST_TAKEN):
-            for offer in taken:
-                if offer.sample_info.valid_data:
-                    self._found[offer.key] = offer.topic_name, _endpoint(offer)
-                elif offer.sample_info.instance_state != InstanceState.Alive:
-                    self._found.pop(offer.key, None)
-        return [endpoint for name, endpoint in self._found.values() if name == topic]
-
-
-def _endpoint(offer: Any) -> Endpoint:
-    return Endpoint(
-        kind=ros_name(offer.type_name),
-        reliable=isinstance(offer.qos[Policy.Reliability], Policy.Reliability.Reliable),
-        latched=offer.qos[Policy.Durability] != Policy.Durability.Volatile,
-        digest=digest_of(offer.qos),
-    )
-
-
-def qos_of(qos: Qos, kind: str) -> DdsQos:
-    """DDS policies of a quality of service, for an endpoint of a message type."""
-    reliable = Policy.Reliability.Reliable(max_blocking_time=NS // 10)
-    return DdsQos(
-        reliable if qos.reliable else Policy.Reliability.BestEffort,
-        Policy.History.KeepLast(qos.depth),
-        Policy.Durability.TransientLocal if qos.latched else Policy.Durability.Volatile,
-        Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
-        user_data(kind),
-    )
 
 
 def sockets_of(domain: int) -> list[socket.socket]:
@@ -189,6 +134,7 @@ class DdsBus(Bus):
         self._conditions: list[ReadCondition] = []
         self._offers = Discovered(self._participant)
         self._wants: Discovered | None = None
+        self._listed = Listed(self._participant, name, names.namespace, self._offers, self._gids)
         self.clock = Clock(sim_time=sim_time)
         if sim_time:
             self.subscribe(CLOCK.name, CLOCK.kind, self._tick, replace(CLOCK.qos.heard, depth=CLOCK_DEPTH))
@@ -196,20 +142,24 @@ class DdsBus(Bus):
     def publisher(self, topic: str, kind: str, qos: Qos) -> Publisher:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
-        writer: DataWriter[Any] = DataWriter(self._participant, self._topic(whole, kind), qos_of(qos, kind))
+        writer: DataWriter[Any] = DataWriter(
+            self._participant, self._topic(whole, kind), qos_of(qos, definition_of(kind)[1])
+        )
         self._writers.append(writer)  # its latched message lives as long as it does
         held = weakref.proxy(writer)  # a publisher that outlives its closed bus must not keep the participant
         return Publisher(
             whole,
             kind,
-            lambda data: held.write(raw(kind, data)),
+            lambda data: held.write(struct_of(kind).deserialize(data)),
             lambda: len(held.get_matched_subscriptions()),
         )
 
     def subscribe(self, topic: str, kind: str, handler: Handler, qos: Qos) -> Subscription:
         """As for `Bus`."""
         whole = self._names.resolve(topic)
-        reader: DataReader[Any] = DataReader(self._participant, self._topic(whole, kind), qos_of(qos, kind))
+        reader: DataReader[Any] = DataReader(
+            self._participant, self._topic(whole, kind), qos_of(qos, definition_of(kind)[1])
+        )
         fresh = ReadCondition(reader, SampleState.NotRead | ViewState.Any | InstanceState.Any)
         self._waiting.attach(fresh)
         self._conditions.append(fresh)
@@ -245,6 +195,7 @@ class DdsBus(Bus):
 
     def spin_once(self, timeout_s: float) -> None:
         """As for `Bus`."""
+        self._listed.look()
         left = self.clock.left_s(timeout_s)
         if self._conditions and left > 0:
             self._waiting.wait(round(left * NS))
@@ -257,7 +208,11 @@ class DdsBus(Bus):
         """As for `Bus`."""
         for held in (self._conditions, self._readers, self._writers, self._topics):
             held.clear()  # type: ignore[attr-defined]
-        del self._waiting, self._offers, self._wants, self._participant
+        del self._waiting, self._listed, self._offers, self._wants, self._participant
+
+    def _gids(self) -> tuple[list[bytes], list[bytes]]:
+        """Identifiers of the subscriptions and publishers of this node."""
+        return [reader.guid.bytes for reader, *_ in self._readers], [w.guid.bytes for w in self._writers]
 
     def _topic(self, whole: str, kind: str) -> "DdsTopic[Any]":
         if (whole, kind) not in self._topics:

@@ -4,6 +4,7 @@ A type has the DDS name that ROS gives it, `sensor_msgs::msg::dds_::Imu_`, and t
 other programs of cyclonedds, which compare structures, match ours.
 """
 
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -34,9 +35,14 @@ def ros_name(dds: str) -> str:
 
 
 @cache
-def struct_of(kind: str) -> type[IdlStruct]:
-    """The structure of a message type, whose samples are bytes; a `DataWriter` takes what `raw` makes."""
-    struct = _struct(kind)
+def struct_of(kind: str, store: Any = None) -> type[IdlStruct]:
+    """The structure of a message type, whose samples are bytes: `struct_of(kind).deserialize(data)`.
+
+    Args:
+        kind: The type.
+        store: Typestore that defines it. Default: that of `magtwin.io.bags.types.fields_of`.
+    """
+    struct = _struct(kind, fields_of if store is None else lambda name: store.fielddefs[name][1])
 
     def serialize(self: Any, buffer: Any = None, endianness: Any = None, use_version_2: Any = None) -> bytes:
         return bytes(self.cdr)
@@ -51,24 +57,19 @@ def struct_of(kind: str) -> type[IdlStruct]:
     return struct
 
 
-def raw(kind: str, data: bytes) -> Any:
-    """A sample of a message type with these bytes as its CDR."""
-    return struct_of(kind).deserialize(data)
-
-
-def _struct(kind: str) -> type[IdlStruct]:
+def _struct(kind: str, fields: Callable[[str], Any] = fields_of) -> type[IdlStruct]:
     name = dds_name(kind)
-    members = {field: _member(described) for field, described in fields_of(kind)}
+    members = {field: _member(described, fields) for field, described in fields(kind)}
     return final(make_idl_struct(name.rpartition("::")[2], name, members))
 
 
-def _member(described: Any) -> Any:
+def _member(described: Any, fields: Callable[[str], Any]) -> Any:
     node, content = described
     if node is Nodetype.BASE:
         return _BASES[content[0]]
     if node is Nodetype.NAME:
-        return _struct(content)
+        return _struct(content, fields)
     element, count = content
     if node is Nodetype.ARRAY:
-        return idl.array[_member(element), count]
-    return idl.sequence[_member(element)]
+        return idl.array[_member(element, fields), count]
+    return idl.sequence[_member(element, fields)]

@@ -15,6 +15,7 @@ FIRST = {
     "localize": "scene",
     "follow": "path",
     "record": "out",
+    "replay": "run",
 }
 """Executables, and the parameter of each that is the positional argument of its command."""
 
@@ -22,7 +23,7 @@ NETWORK = ("discovery", "backend", "domain")
 """Parameters of every node that are options; an empty one is not set."""
 
 OPTIONS = {
-    "magnetometer": ("network", "duration_s", "frame_prefix", *NETWORK),
+    "magnetometer": ("network", "online", "measured", "duration_s", "frame_prefix", *NETWORK),
     "localize": (
         *("method", "option", "map", "sensor", "odometry", "map_length_m", "seed", "duration_s"),
         *("frame_prefix", *NETWORK),
@@ -84,7 +85,7 @@ def arguments(node: str, given: list[str]) -> list[str]:
             own.append(f"{name}:={value}")
         elif name != "use_sim_time":
             own.append(f"--{name.replace('_', '-')}={value}")
-        elif node != "sim":  # which publishes the time
+        elif node not in ("sim", "replay"):  # which publish the time
             own.append(f"--sim-time={value}")
     named = [f"--{name}={value}" for name, value in options.items()]
     return ["ros", node, *first, *own, *named, *remaps]
@@ -151,4 +152,4 @@ def _starter(node: str) -> Callable[[], None]:
     return lambda: start(node)
 
 
-sim, magnetometer, localize, follow, record = map(_starter, FIRST)
+sim, magnetometer, localize, follow, record, replay = map(_starter, FIRST)
