@@ -7,11 +7,7 @@ from magtwin.errors import InputError
 
 
 def parse_day(day: str | datetime.date, what: str = "date") -> datetime.date:
-    """Parse a day, YYYY-MM-DD.
-
-    Raises:
-        InputError: It is not a day; the text begins with `what`.
-    """
+    """Parse a day, YYYY-MM-DD."""
     if isinstance(day, datetime.datetime):
         return day.date()
     if isinstance(day, datetime.date):
@@ -32,11 +28,7 @@ def check_day(day: str, what: str) -> None:
 
 
 def check_texts(survey: object, names: Sequence[str]) -> None:
-    """Refuse metadata of a survey or a map that is not text, and a `created` that is not a day.
-
-    Raises:
-        InputError: The text names the attribute.
-    """
+    """Refuse metadata of a survey or a map that is not text, and a `created` that is not a day."""
     kind = type(survey).__name__
     for name in names:
         text = getattr(survey, name)

@@ -45,13 +45,7 @@ class Grid(Summarized):
     def over(cls, extent: ArrayLike, spacing_m: float, headings_rad: ArrayLike) -> "Grid":
         """A grid of a given spacing, centred in a rectangle and within it.
 
-        Args:
-            extent: Least x, greatest x, least y, greatest y [m].
-            spacing_m: Distance between nodes in x and y [m].
-            headings_rad: Headings [rad], ascending in [0, 2 pi).
-
-        Raises:
-            InputError: The spacing is not above 0, or leaves no cell.
+        The rectangle is least x, greatest x, least y, greatest y [m]; headings [rad] ascend in [0, 2 pi).
         """
         x0, x1, y0, y1 = (float(v) for v in np.asarray(extent, float))
         if not (np.isfinite(spacing_m) and spacing_m > 0):
@@ -74,13 +68,7 @@ class Grid(Summarized):
 
     @classmethod
     def filling(cls, extent: ArrayLike, widest_m: float, headings_rad: ArrayLike) -> "Grid":
-        """A grid with nodes on the borders of a rectangle, and cells as wide as possible up to `widest_m`.
-
-        Args:
-            extent: Least x, greatest x, least y, greatest y [m].
-            widest_m: Largest distance between nodes [m].
-            headings_rad: Headings [rad], ascending in [0, 2 pi).
-        """
+        """A grid with nodes on the borders of a rectangle, and cells as wide as possible up to `widest_m`."""
         x0, x1, y0, y1 = (float(v) for v in np.asarray(extent, float))
         across, along = (max(1, int(np.ceil(length / widest_m - 1e-9))) for length in (x1 - x0, y1 - y0))
         return cls(
@@ -92,11 +80,7 @@ class Grid(Summarized):
         ).in_memory()
 
     def in_memory(self) -> "Grid":
-        """The grid, if arrays over all its nodes fit in memory.
-
-        Raises:
-            InputError: It has more than `MOST_NODES`.
-        """
+        """The grid, if arrays over all its nodes fit in memory."""
         headings, rows, columns = self.shape
         if headings * rows * columns > MOST_NODES:
             raise InputError(
@@ -145,11 +129,7 @@ class Grid(Summarized):
 
 
 def check_axes(grid: Any) -> None:
-    """Check `headings_rad` of a grid or a map, and make `origin_m` and `cell_m` pairs of floats.
-
-    Raises:
-        InputError: The headings do not ascend in [0, 2 pi), or a pair is not two lengths.
-    """
+    """Check `headings_rad` of a grid or a map, and make `origin_m` and `cell_m` pairs of floats."""
     kind, headings = type(grid).__name__, np.asarray(grid.headings_rad, float)
     ascend = headings.ndim == 1 and headings.size and np.all(np.diff(headings) > 0)
     if not (ascend and headings[0] >= 0 and headings[-1] < TURN):

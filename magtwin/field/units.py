@@ -32,11 +32,7 @@ def nt_per(unit: str | None, scale: float | None) -> float:
 
 
 def check_factor(unit: str | None, scale: float | None) -> None:
-    """Refuse a unit and a scale for the same field, and a scale that is no factor.
-
-    Raises:
-        InputError: It is refused.
-    """
+    """Refuse a unit and a scale for the same field, and a scale that is no factor."""
     if scale is None:
         return
     if unit is not None:
@@ -58,23 +54,10 @@ def check_unit(
 ) -> str:
     """Refuse readings whose median cannot be the Earth's field, and readings in two units.
 
-    Args:
-        b_nt: Field magnitudes [nT], shape (N,), in the order of the file.
-        where: File, for the error.
-        column: Column, for the error.
-        unit: Unit that the file was read in.
-        row: Gives the place of a reading from its index. Default: the file.
-        scale: Factor from the file's values to nT, in place of a unit.
-        told: Whether the header or the user gave the unit. Then the median may be ten times beyond the
-            bounds, as beside steel.
-        p_xy: Positions [m], shape (N, 2), to look for rows in another unit. None: all rows are in one.
-
-    Returns:
-        A warning about a median that the Earth's field does not have; "" if it has.
-
-    Raises:
-        InputError: The median is outside 10,000..100,000 nT (the text names the unit that would fit), or more
-            than 1 % of the readings are in another unit.
+    Readings `b_nt` [nT] are in the order of the file `where`; `row` gives the place of one. If the unit was
+    `told` by the header or the user, the median may be ten times beyond the bounds, as beside steel. With
+    positions `p_xy` [m], (N, 2), rows in another unit are looked for. Returns a warning about a median that
+    the Earth's field does not have; "" if it has.
     """
     import numpy as np
 
@@ -143,11 +126,7 @@ def _check_one_unit(
 
 
 def unit_by_size(b: "NDArray[np.float64]") -> Unit | None:
-    """Deduce the unit in which magnitudes have the size of the Earth's field indoors; None if none fits.
-
-    Args:
-        b: Magnitudes as the file has them, shape (N,); nan is ignored.
-    """
+    """Deduce the unit in which magnitudes have the size of the Earth's field indoors; None if none fits."""
     import numpy as np
 
     b = np.abs(b[np.isfinite(b)])

@@ -42,24 +42,15 @@ def check(
     Readings that are not good are ignored. Every method is fitted anew to each part, including its
     hyperparameters.
 
-    Args:
-        readings: A survey.
-        methods: Names of map methods. Default: all but "auto".
-        split: "checkerboard": every other node of a gridded survey at all headings, then the others.
-            "heading": one nominal heading of a gridded survey at a time. "run": one run at a time. "block":
-            every fifth block of three spacings, in five turns. Or the rows to fit and to predict of each
-            turn. Default: the first of checkerboard, run and block that the survey allows.
-        options: Options by name of the method.
-        progress: Called as progress(done, total, what).
+    A split is "checkerboard" (every other node of a gridded survey at all headings, then the others),
+    "heading" (one at a time), "run" (one at a time) or "block" (every fifth block of three spacings, in five
+    turns); by default the first of checkerboard, run and block that the survey allows. `options` are by name
+    of the method.
 
-    Returns:
-        For each method, and for the mean of the fitted readings as "naive": RMSE, mean and median absolute
-        error [nT]; the share of readings that it predicts; the share within its 90 % interval; the mean log
-        predictive density [log 1/nT] (higher is better), for normal errors of its variance and noise. For
-        gridded surveys also errors and coverage by heading.
-
-    Raises:
-        InputError: No such method or split, the split does not fit the survey, or nothing is left to predict.
+    For each method (default: all but "auto"), and for the mean of the fitted readings as "naive", the report
+    has RMSE, mean and median absolute error [nT]; the shares that it predicts and that lie in its 90 %
+    interval; the mean log predictive density [log 1/nT], for normal errors of its variance and noise; for
+    gridded surveys also errors and coverage by heading.
     """
     methods = [name for name in METHODS if name != "auto"] if methods is None else list(methods)
     for name in methods:

@@ -131,17 +131,9 @@ def fit_auto(
     grows slowly, and each later fit of a candidate continues from its earlier one. Surveys with fewer than
     `LEAST_READINGS` good readings get a harmonic fit.
 
-    Args:
-        readings: A survey; only its good readings are used.
-        earth_nt: The Earth's field in world axes [nT], for the harmonic fit. Default: that of the readings.
-        kernel: The only kernel of the Gaussian process that is tried. Default: both.
-        progress: Called as progress(done, total, what).
-
-    Returns:
-        The fitted model. Its parameters name the candidates, with RMSE, log score and coverage of each.
-
-    Raises:
-        InputError: No candidate fits the survey.
+    Options: the Earth's field `earth_nt` in world axes [nT] for the harmonic fit, and the only `kernel` of
+    the Gaussian process that is tried. The parameters of the model name the candidates, with RMSE, log score
+    and coverage of each.
     """
     tried = _candidates(readings, earth_nt, kernel)
     held = _held_out(readings)

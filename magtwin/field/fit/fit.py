@@ -50,14 +50,7 @@ def fit(
     readings in an order and built-in methods also in axes of their own (`magtwin.field.survey.axes`). So the
     field moves and turns with the survey, and the order of its rows does not matter.
 
-    Args:
-        readings: A survey.
-        method: Name of a map method, see `magtwin.field.fit.methods`.
-        progress: Called as progress(done, total, what) by slow methods.
-        **options: Options of the method.
-
-    Raises:
-        InputError: There is no such method or option, or the method refuses the readings.
+    `options` are those of the method; slow ones call progress(done, total, what).
     """
     function = _checked(method, options)
     if not hasattr(function, "own_axes"):
@@ -152,24 +145,10 @@ def raster(
     stuck: where the nearest reading is not good and good ones are over half a spacing away, at any heading.
     Trilinear and cubic models of gridded surveys have their own mask.
 
-    Args:
-        model: The fit.
-        readings: The readings that it was fitted to.
-        spacing_m: Distance between nodes [m]. Default: for "trilinear" on a gridded survey its own nodes,
-            else the widest spacing with almost no loss of accuracy (`magtwin.field.fit.resolution`).
-        headings_rad: Headings of the layers [rad], ascending in [0, 2 pi). Default: for "trilinear" on a
-            gridded survey its own; the heading of a survey with only one; else the fewest of 4 to 24 with
-            almost no loss of accuracy.
-        progress: Called as progress(done, total, what), once per heading.
-
-    The variance of a map of one drive has that of an offset, see `offset_sd_nt`.
-
-    Returns:
-        The map with values, variance, method, parameters, the survey's metadata and, if the model has one,
-        the harmonic field. The parameters include the errors of interpolation between its nodes and headings.
-
-    Raises:
-        InputError: The spacing leaves no cell, the headings do not ascend, or no node is valid.
+    Nodes are `spacing_m` apart, by default those of a trilinear fit of a gridded survey, else as wide as
+    `resolution` finds; so are the headings, in 4 to 24, or the only one of the survey. The parameters of the
+    map hold the errors of interpolation between nodes and headings; the variance of a map of one drive has
+    that of an offset, see `offset_sd_nt`.
     """
     say = progress or (lambda done, total, what: None)
     say(0, 1, "resolution")

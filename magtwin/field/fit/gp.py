@@ -117,17 +117,9 @@ def fit_gp(
     and sector of heading; their scatter adds to the noise. The hyperparameters, including the field's
     strength in each patch of the floor, maximise the marginal likelihood by L-BFGS from several starts.
 
-    Args:
-        readings: A survey.
-        kernel: Function of distance (`Covariance`).
-        like: A fit with the same kernel to other readings of the same survey. The optimisation starts from
-            its hyperparameters, which saves the starts.
-        steps: Most steps of the optimisation. Default: `STEPS`, or `RESUMED_STEPS` from an earlier fit.
-        progress: Called as progress(done, total, what).
-
-    Raises:
-        InputError: There are fewer than four good readings, they are on one line or all the same, or the
-            kernel is unknown.
+    `like` is a fit with the same kernel to other readings of the same survey. The optimisation starts from
+    its hyperparameters, which saves the starts. `steps` are the most of the optimisation; by default `STEPS`,
+    or `RESUMED_STEPS` from an earlier fit.
     """
     if kernel not in ("matern", "poisson"):
         raise InputError(f'kernel must be "matern" or "poisson", got {kernel!r}')

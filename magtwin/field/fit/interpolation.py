@@ -42,20 +42,14 @@ def fit_trilinear(readings: Readings, *, fill: bool = False) -> "GridInterpolati
     Recorded headings are not used, as in the paper. A scattered survey is interpolated over Delaunay
     triangles.
 
-    Args:
-        readings: A survey; only its good readings are used.
-        fill: Whether to fill nodes of a gridded survey that have no good reading, from the nearest good ones
-            on both sides in row and column of the same heading: linear between each two, weighted by 1 / (a
-            b)^2 with distances a and b. Otherwise cells at such a node are unknown.
+    `fill`: nodes of a gridded survey that have no good reading are filled from the nearest good ones on both
+    sides in row and column of the same heading: linear between each two, weighted by 1 / (a b)^2 with
+    distances a and b. Otherwise cells at such a node are unknown.
 
-    Returns:
-        The model. Its variance is that of a reading (`magtwin.field.survey.node_errors`; for a scattered
-        survey, that of readings at one place), plus the interpolation error: from the second differences of
-        the nodes (`magtwin.field.maps.curvature`), or, if nodes are filled and for a scattered survey, that
-        at positions left out in turn (`Roughness`).
-
-    Raises:
-        InputError: There are fewer than four good readings, they are on one line, or all are the same.
+    The variance is that of a reading (`magtwin.field.survey.node_errors`; for a scattered survey, that of
+    readings at one place), plus the interpolation error: from the second differences of the nodes
+    (`magtwin.field.maps.curvature`), or, if nodes are filled and for a scattered survey, that at positions
+    left out in turn (`Roughness`).
     """
     return _fit(readings, "trilinear", fill)
 
@@ -72,11 +66,7 @@ def fit_cubic(readings: Readings, *, fill: bool = False) -> "GridInterpolation |
 
 
 def check_readings(readings: Readings) -> None:
-    """Refuse readings from which no method can make a map.
-
-    Raises:
-        InputError: Fewer than four are good, they are on one line, or all are the same to the last digit.
-    """
+    """Refuse readings from which no method can make a map."""
     good = readings.good
     count, of = int(np.count_nonzero(good)), f"of {len(readings)} in {readings.name or 'the survey'}"
     if count < LEAST:

@@ -128,11 +128,7 @@ def values_of(model: FieldModel, p_xy: ArrayLike, yaw: ArrayLike) -> Array:
 
 
 def flat_poses(p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
-    """Broadcast poses to rows; also returns their shape.
-
-    Raises:
-        InputError: p_xy does not have two columns.
-    """
+    """Broadcast poses to rows; also returns their shape."""
     p, angle = np.asarray(p_xy, float), np.asarray(yaw, float)
     if p.ndim == 0 or p.shape[-1] != 2:
         raise InputError(f"p_xy must have shape (..., 2), got {p.shape}")

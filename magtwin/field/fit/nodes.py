@@ -13,13 +13,7 @@ ROOT = 0.5  # Power of the variance that is interpolated
 def variance_at_nodes(p_xy: Array, step_m: float, variance_of: Callable[[Array], Array]) -> Array:
     """Variances at evenly spaced nodes, computed at nodes at most `step_m` apart.
 
-    Args:
-        p_xy: Nodes of a grid [m], shape (Y, X, 2).
-        step_m: Largest distance between nodes at which the variance is computed [m].
-        variance_of: Variances [nT^2], shape (N,), at positions of shape (N, 2).
-
-    Returns:
-        Variances [nT^2], shape (Y, X).
+    Nodes have shape (Y, X, 2), variances [nT^2] (Y, X); `variance_of` takes positions (N, 2).
     """
     cell = np.linalg.norm(p_xy[1, 0] - p_xy[0, 0]), np.linalg.norm(p_xy[0, 1] - p_xy[0, 0])
     shape = p_xy.shape[:2]

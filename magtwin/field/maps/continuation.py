@@ -39,18 +39,9 @@ def at_height(field: AnomalyMap, height_m: float) -> AnomalyMap:
     its guess error: the RMS slope of the layer times twice the distance to the nearest valid node, at most
     sqrt(2) times the layer's spread.
 
-    Args:
-        field: The map; its height must be known.
-        height_m: Height of the sensor above the floor [m]. A grid can go down by a quarter of a cell, since
-            its noise grows as exp(dz |k|). A harmonic field can go down to the floor, but no nearer to a
-            layer of dipoles than their spacing.
-
-    Returns:
-        The continued map, valid where the map is. Its variance is None if the map's is, or if it is farther
-        below than a grid can go.
-
-    Raises:
-        InputError: The map's height is unknown, or `height_m` is out of reach.
+    A grid can go down by a quarter of a cell, since its noise grows as exp(dz |k|). A harmonic field can go
+    down to the floor, but no nearer to a layer of dipoles than their spacing; farther below than a grid can
+    go, the result has no variance.
     """
     if not np.isfinite(height_m):
         raise InputError(f"height_m must be a length [m], got {height_m!r}")

@@ -26,16 +26,9 @@ def interpolation_error_nt2(
     heading, waves of order k and amplitude A through the layers err by A (1 - cos(k g / 2)) midway over a gap
     g, on the mean over their phase A^2 / 2 of the square of that.
 
-    Args:
-        values_nt: Field at the nodes [nT], shape (H, Y, X).
-        valid: Nodes that count, shape (H, Y, X).
-        headings_rad: Headings of the layers [rad], ascending in [0, 2 pi), shape (H,).
-        noise_nt2: Variance of the nodes' own errors [nT^2], independent of each other, shape (H, Y, X).
-            Default: 0, as for a smooth model.
-
-    Returns:
-        Mean squared errors [nT^2], of cells and of headings, shape (2, H, Y, X). Two headings count as one
-        phase of a wave; between headings the error of one is 0.
+    Values, `valid` nodes that count and the variance of the nodes' own errors (independent; 0 for a smooth
+    model) have shape (H, Y, X), the result (2, H, Y, X): cells and headings. Two headings count as one phase
+    of a wave; between headings the error of one is 0.
     """
     known = np.where(valid, values_nt, np.nan)
     noise = np.zeros(known.shape) if noise_nt2 is None else np.where(valid, noise_nt2, np.nan)

@@ -144,16 +144,8 @@ def difference(a: AnomalyMap, b: AnomalyMap) -> MapDifference:
     1995): with two-sided normal p-values in ascending order, the last p_k <= k q / m. The false-discovery
     rate is q = 5 %, for independent or positively dependent errors.
 
-    Args:
-        a: The earlier survey.
-        b: The later one.
-
-    Returns:
-        Changes, bias, z and the regions of changed nodes.
-
-    Raises:
-        InputError: The maps have no node in common, or differ in frame, datum or height. If one of these is
-            unknown, the report has a caution.
+    `a` is the earlier survey, `b` the later one. Maps without a common node, or that differ in frame, datum
+    or height, are refused. If one of these is unknown, the report has a caution.
     """
     a, b = a.relative(), b.relative()
     cautions = _compared(a, b)

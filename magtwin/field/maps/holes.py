@@ -15,15 +15,6 @@ def filled(field: AnomalyMap) -> AnomalyMap:
     A filled value is the mean of its four neighbours (the discrete Laplace equation), so it lies between the
     least and the greatest value on the hole's edge. Its standard deviation is the spread of the values on the
     edges of all holes of its heading.
-
-    Args:
-        field: The map; values at masked nodes are ignored.
-
-    Returns:
-        The map with every node valid.
-
-    Raises:
-        InputError: A heading has no valid node.
     """
     holes = ~field.valid
     if not holes.any():

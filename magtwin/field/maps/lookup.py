@@ -134,9 +134,8 @@ class Lookup:
     ) -> tuple[tuple[NDArray[np.intp], ...], tuple[Array, ...], tuple[NDArray[np.bool_], ...], NDArray]:
         """Cells of points (N, 2) on the floor.
 
-        Returns:
-            Their columns and rows; the weights of the higher nodes along x and y; whether the points are
-            inside along x and y; whether the field is unknown there.
+        Their columns and rows; the weights of the higher nodes along x and y; whether the points are inside
+        along x and y; whether the field is unknown there.
         """
         x0, y0, dx, dy, _, _, _, rows, columns = self.figures
         unknown = np.zeros(len(p), bool)

@@ -65,11 +65,7 @@ class MadeFrom:
 
     @classmethod
     def from_table(cls, table: Any) -> "MadeFrom":
-        """The values of a table.
-
-        Raises:
-            InputError: A key is missing, or a value is of another type.
-        """
+        """The values of a table."""
         names = {f.name for f in fields(cls)}
         if not isinstance(table, dict) or set(table) != names:
             raise InputError(f"must have the keys {', '.join(sorted(names))}")

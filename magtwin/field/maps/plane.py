@@ -52,12 +52,8 @@ class Plane:
     def field_and_slopes_nt(self, p_xy: ArrayLike) -> tuple[Array, Array]:
         """The field and its slopes along x and y.
 
-        Args:
-            p_xy: Points of the plane [m], shape (N, 2).
-
-        Returns:
-            Field in world axes [nT], shape (N, 3), and dB/dx, dB/dy [nT/m], shape (N, 2, 3); nan if a point
-            is not finite or over 130 km from the origin.
+        Points have shape (N, 2) [m], the field in world axes (N, 3) [nT], dB/dx and dB/dy (N, 2, 3) [nT/m];
+        nan if a point is not finite or over 130 km from the origin.
         """
         p = np.asarray(p_xy, float)
         if p.ndim != 2 or p.shape[1] != 2:

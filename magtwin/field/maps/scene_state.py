@@ -33,9 +33,8 @@ SAME_M = 1e-4
 def made_from(scene: Scene, *, height_m: float | None = None) -> MadeFrom:
     """What a map of a scene is made from.
 
-    Args:
-        scene: The scene, its robot as it surveys; its map is not read.
-        height_m: Height of the magnetometer above the floor [m]. Default: the robot's.
+    Its robot is as it surveys; its map is not read. `height_m` is that of the magnetometer above the floor,
+    by default the robot's.
     """
     x, y, z = _sensor_m(scene.robot)
     return MadeFrom(
@@ -88,12 +87,7 @@ def _text(value: Any) -> str:
 def changes_since(made: MadeFrom, scene: Scene) -> list[str]:
     """What has changed in a scene since a map was made from it.
 
-    Args:
-        made: What the map was made from.
-        scene: The scene, its robots as they were surveyed: in no session.
-
-    Returns:
-        What has changed since, one text each. Empty if nothing has.
+    One text each; empty if nothing has. Robots of the scene are as they were surveyed: in no session.
     """
     texts, now = list[str](), _bodies(scene)
     if scene.earth is not None or now:  # else the map alone is the field

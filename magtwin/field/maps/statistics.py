@@ -53,10 +53,7 @@ _TEXTS = ("method", "frame", "datum", "created", "licence")
 def map_metadata(field: AnomalyMap) -> Report:
     """All that is known about a map: statistics, uncertainty, method and source.
 
-    Returns:
-        Statistics of the map and of each heading, share of valid nodes, standard deviation, height, the
-        harmonic field and the robot of the survey. The metadata: method with its parameters, frame,
-        datum, day, licence, and source files with checksums. Unknown entries are "unknown".
+    Unknown entries are "unknown".
     """
     figures = [*field.report().figures]
     share = 100 * field.known.nodes / math.prod(field.grid.shape)
@@ -100,9 +97,7 @@ def offset_figures(field: AnomalyMap) -> list[Figure]:
 def source_files(source: str) -> dict[str, str]:
     """Source files of a map with their SHA-256, by name; empty if the source has another format.
 
-    Args:
-        source: `AnomalyMap.source`, as "name sha256:hex; name sha256:hex". Different files of one name are
-            numbered: "name (2)".
+    Different files of one name are numbered: "name (2)".
     """
     files: dict[str, str] = {}
     for part in source.split("; "):
@@ -156,12 +151,8 @@ OUTER_PERCENT = 0.5
 def colour_limits(values: ArrayLike, outer_percent: float = OUTER_PERCENT) -> tuple[float, float]:
     """Values at the two ends of a colour scale.
 
-    Args:
-        values: Values to show, any shape; those that are not finite are ignored.
-        outer_percent: Share left out at either end [%].
-
-    Returns:
-        Least and greatest of the rest; 0 and 1 if no value is finite.
+    Values that are not finite are ignored; `outer_percent` is left out at either end. 0 and 1 if no value is
+    finite.
     """
     known = np.asarray(values, float)
     known = known[np.isfinite(known)]

@@ -74,11 +74,7 @@ class Body:
     def exact_field_nt(self, p_world: ArrayLike) -> Array:
         """Its exact field, also inside, by magpylib (Ortner and Coliado Bandeira 2020).
 
-        Args:
-            p_world: Points [m], shape (N, 3).
-
-        Returns:
-            Field in world axes [nT], shape (N, 3).
+        Points [m] and field in world axes [nT] have shape (N, 3).
         """
         import magpylib  # its scipy takes 0.3 s
 
@@ -120,13 +116,8 @@ def induced_magnetization(body: Body, susceptibility: float, b_world_nt: ArrayLi
     Sato and Ishii's fit of it (1989, J. Appl. Phys. 66, 983), for a mesh that of the box with its second
     moments. The fields of other bodies are neglected.
 
-    Args:
-        body: Shape and rotation; its magnetization is ignored.
-        susceptibility: chi [1].
-        b_world_nt: The Earth's field in world axes [nT], shape (3,).
-
-    Returns:
-        Magnetization in the body's axes [A/m], shape (3,).
+    The body's magnetization is ignored. The Earth's field is in world axes [nT], the result in the body's
+    [A/m].
     """
     h = np.asarray(b_world_nt, float) @ body.rotation / (NT_PER_T * MU_0)
     return np.asarray(susceptibility * np.linalg.solve(np.eye(3) + susceptibility * demagnetising(body), h))
@@ -321,11 +312,8 @@ class Bodies:
     def field_nt(self, p_world: ArrayLike) -> Array:
         """Their field.
 
-        Args:
-            p_world: Points [m], shape (..., 3).
-
-        Returns:
-            Field in world axes [nT], shape (..., 3); not finite at a dipole or if a point is not.
+        Points [m] and field in world axes [nT] have shape (..., 3); not finite at a dipole or if a point is
+        not.
         """
         p = np.asarray(p_world, float)
         if p.ndim == 0 or p.shape[-1] != 3:
@@ -337,12 +325,7 @@ class Bodies:
 
         The rate is analytic for dipoles; for exact fields it is a difference over 20 um along the motion.
 
-        Args:
-            p_world: Points [m], shape (..., 3).
-            v_world: Their velocities [m/s], shape (..., 3).
-
-        Returns:
-            Field [nT] and its rate of change [nT/s] in world axes, each of shape (..., 3).
+        Points [m], velocities [m/s], field [nT] and rate [nT/s], in world axes, have shape (..., 3).
         """
         p, v = np.asarray(p_world, float), np.asarray(v_world, float)
         if p.ndim == 0 or p.shape[-1] != 3 or v.shape != p.shape:

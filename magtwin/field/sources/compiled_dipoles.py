@@ -40,17 +40,8 @@ def dipole_field_and_gradient_nt(
     (Jackson, Classical Electrodynamics, 3rd ed. 1999, the derivative of eq. 5.56): symmetric, as curl B = 0,
     and of trace 0, as div B = 0.
 
-    Args:
-        p_world: Observation points [m], shape (..., 3).
-        p_world_dipole: Dipole positions [m], shape (D, 3).
-        m_world: Dipole moments [A m^2], shape (D, 3).
-
-    Returns:
-        Field [nT], the same bytes as from `dipole_field_nt`, shape (..., 3), and dB_i/dx_j [nT/m], shape
-        (..., 3, 3), in world axes.
-
-    Raises:
-        InputError: A shape is wrong.
+    Shapes are those of `dipole_field_nt`. The field [nT] has the same bytes as from there; the gradient
+    dB_i/dx_j [nT/m], in world axes, has shape (..., 3, 3).
     """
     field, five = _sum(p_world, p_world_dipole, m_world, gradient=True)
     xx, xy, xz, yy, yz = np.moveaxis(five, -1, 0)

@@ -30,16 +30,8 @@ def dipole_field_nt(p_world: ArrayLike, p_world_dipole: ArrayLike, m_world: Arra
 
     B(p) = mu_0 / 4 pi * sum_d (3 (m_d . u) u - m_d) / |r|^3,  r = p - p_d,  u = r / |r|
 
-    Args:
-        p_world: Observation points [m], shape (..., 3).
-        p_world_dipole: Dipole positions [m], shape (D, 3).
-        m_world: Dipole moments [A m^2], shape (D, 3).
-
-    Returns:
-        Field in world axes [nT], shape (..., 3); not finite at a dipole itself, zero for no dipoles.
-
-    Raises:
-        InputError: A shape is not as above.
+    Points have shape (..., 3) [m], dipoles and moments [A m^2] (D, 3), the field in world axes [nT] (..., 3):
+    not finite at a dipole itself, zero for no dipoles.
     """
     p, place, moment = checked(p_world, p_world_dipole, m_world)
     points = p.reshape(-1, 3)

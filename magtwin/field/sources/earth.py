@@ -20,19 +20,10 @@ def earth_field_nt(
 ) -> tuple[float, float, float]:
     """The field of the IGRF-14 (Alken et al. 2021 and its 2024 revision), to degree 13, by ppigrf.
 
-    Args:
-        latitude_deg: Geodetic latitude [deg], between -90 and 90, without the poles.
-        longitude_deg: Longitude [deg], positive east of Greenwich.
-        height_m: Height above the WGS 84 ellipsoid [m].
-        date: The day, or YYYY-MM-DD; its field is that of 00:00 UTC, as in tables of the IGRF. Within a day
-            it changes by some tenths of a nT.
-        north_deg: Angle from world +y to true north about world +z, counter-clockwise seen from above [deg].
-
-    Returns:
-        Field in world axes [nT]; east, north and up if true north is along +y.
-
-    Raises:
-        InputError: The day is invalid or outside the model's span, or the place is not on Earth.
+    The latitude is geodetic, the longitude positive east of Greenwich, the height above the WGS 84 ellipsoid.
+    The day's field is that of 00:00 UTC, as in tables of the IGRF; within a day it changes by some tenths of
+    a nT. `north_deg` is the angle from world +y to true north about world +z, counter-clockwise seen from
+    above. The result is in world axes [nT]: east, north and up if true north is along +y.
     """
     import ppigrf  # its pandas takes 0.3 s
 

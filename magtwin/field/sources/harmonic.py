@@ -71,12 +71,8 @@ class HarmonicField(Summarized):
     def field_nt(self, p_world: ArrayLike, *, compiled: bool = False) -> Array:
         """Field without the robot, in world axes.
 
-        Args:
-            p_world: Points above the dipoles [m], shape (..., 3).
-            compiled: Whether to use compiled code, equal up to rounding and faster for many points.
-
-        Returns:
-            Field [nT], shape (..., 3).
+        Points above the dipoles [m] and field [nT], shape (..., 3). Compiled code is equal up to rounding and
+        faster for many points.
         """
         sums = dipole_field_nt
         if compiled:
@@ -90,14 +86,8 @@ class HarmonicField(Summarized):
     ) -> Array:
         """What the survey's robot reads at rest at a pose.
 
-        Args:
-            p_xy: Positions of base_link in world [m], shape (..., 2).
-            yaw: Headings [rad], shape (...); the two shapes are broadcast.
-            height_m: Height of the sensor above the floor [m]. Default: the survey's.
-            compiled: As for `field_nt`.
-
-        Returns:
-            Field magnitude [nT], shape (...).
+        Positions of base_link [m], shape (..., 2), and headings [rad], shape (...), are broadcast; the height
+        of the sensor above the floor [m] is by default the survey's. Field magnitude [nT], shape (...).
         """
         p, yaw = np.asarray(p_xy, float), np.asarray(yaw, float)
         shape = np.broadcast_shapes(p.shape[:-1], yaw.shape)

@@ -12,12 +12,7 @@ from magtwin.spec.magnetics import SourceSpec
 def body_of(source: SourceSpec, b_world_nt: tuple[float, float, float] | None = None) -> Body:
     """The magnetised body of a source that is no point, induced magnetization included.
 
-    Args:
-        source: What is magnetised.
-        b_world_nt: The Earth's field in world axes [nT]. None if it is not known.
-
-    Raises:
-        InputError: The source has a susceptibility, and the Earth's field is not known.
+    The Earth's field is in world axes [nT], None if it is not known; a source with a susceptibility needs it.
     """
     body = Body(
         shape=source.shape,

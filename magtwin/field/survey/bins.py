@@ -33,14 +33,8 @@ def bin_readings(
 ) -> tuple[Bins, NDArray[np.intp]]:
     """Average the good readings that lie together.
 
-    Args:
-        readings: A survey.
-        cell_m: Side of a cell of the floor [m].
-        sectors: Number of heading sectors; 1 averages all headings.
-        by_run: Whether to keep runs apart.
-
-    Returns:
-        The bins, ordered by run, sector, row and column; and the bin of each good reading, shape (good,).
+    Cells of the floor have sides `cell_m`; 1 sector averages all headings. Returns the bins, ordered by run,
+    sector, row and column; and the bin of each good reading, shape (good,).
     """
     rows = np.flatnonzero(readings.good)
     p, yaw, b = readings.p_xy[rows], readings.yaw[rows], readings.b_nt[rows]
@@ -62,9 +56,6 @@ def spacing_m(readings: Readings) -> float:
     For a gridded survey the shorter side of its cells. For a scattered one, the spacing at which the median
     distance from a point to the nearest node equals the measured median distance to the nearest good reading.
     Points are taken in the bounding box, at most a tenth of its longer side from a reading.
-
-    Raises:
-        InputError: All good readings are at one place.
     """
     if readings.grid is not None:
         return min(readings.grid.cell_m)

@@ -57,20 +57,11 @@ def read_grid(folder: str | os.PathLike[str], **options: Any) -> Readings:
     `magtwin.field.survey.nodes` writes them, supply metadata that the options do not, and the rows that are
     not field.
 
-    Args:
-        folder: Folder of the files. Other files in it are ignored.
-        **options: `name`, `licence`, `created`, `height_m`, `frame`, `datum`: fields of the result.
-            `headings_deg`: the headings of the survey [deg]; by default the files must be evenly spaced on
-            the circle and at most 90 deg apart, so that a missing file is noticed. `unit`: one of
-            `magtwin.field.units.NT_PER`; or `scale`: factor from the file's values to nT.
-
-    Returns:
-        Readings by heading and row, one run per file, with `grid` and `node`. All are good except those that
-        the files mark; `magtwin.field.survey.stuck` finds others.
-
-    Raises:
-        InputError: A file or heading is missing, a row or value is invalid, the grid has a hole or a
-            duplicate node, the headings' grids differ, or the unit is wrong; with file and line.
+    Options are `name`, `licence`, `created`, `height_m`, `frame`, `datum`: fields of the result.
+    `headings_deg`: the headings of the survey [deg]; by default the files must be evenly spaced on the circle
+    and at most 90 deg apart, so that a missing file is noticed. `unit`, or `scale`: factor from the file's
+    values to nT. Readings are by heading and row, one run per file, all good except those that the files
+    mark.
     """
     return read_layers(folder, **options)[1]
 
@@ -336,11 +327,7 @@ def _nodes(layer: Layer, x: Array, y: Array) -> NDArray[np.intp]:
 
 
 def _metadata(path: Path, lines: Sequence[tuple[int, str]]) -> dict[str, Any]:
-    """Read the comment lines (number, text) that an import restores; others are ignored.
-
-    Raises:
-        InputError: A value is not JSON, has the wrong type, or its key occurs twice; with file and line.
-    """
+    """Read the comment lines (number, text) that an import restores; others are ignored."""
     metadata: dict[str, Any] = {}
     for number, line in lines:
         match = _LINE.match(line.strip())

@@ -29,11 +29,8 @@ def without_repeats(readings: Readings) -> Readings:
     The first reading of each group of equal values is kept. Of a longer group than the logger makes, one
     reading per usual length is kept, so that a stuck sensor still shows.
 
-    Args:
-        readings: A survey. A gridded one is returned as it is.
-
-    Returns:
-        The readings that are kept, whose `source` gives their number. `readings` itself if no run has any.
+    A gridded survey is returned as it is. The `source` of the result gives the number of readings that are
+    kept.
     """
     if readings.grid is not None:
         return readings

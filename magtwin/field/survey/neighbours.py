@@ -86,8 +86,7 @@ class LocalFit:
     def left_out(self, rows: NDArray[np.intp], pool: NDArray[np.intp]) -> tuple[Array, Array]:
         """Residuals of `rows` from the prediction by their neighbours in `pool`, without themselves.
 
-        Returns:
-            Residuals over their standard deviation, and residuals [nT], each of shape (R,).
+        Returns residuals over their standard deviation, and residuals [nT], each of shape (R,).
         """
         mean, variance = self._given(self._neighbours(rows, pool), rows)
         residual = self.residual_nt[rows] - mean

@@ -39,16 +39,9 @@ METHOD = "survey, one reading a node and heading, the robot at rest"
 def node_map(readings: Readings) -> AnomalyMap:
     """The map whose values are the readings themselves, each at its node.
 
-    Args:
-        readings: A gridded survey. Several good readings at one node are averaged.
-
-    Returns:
-        The map on the survey's grid. Nodes without a good reading are not valid; their value is the mean of
-        the others, or nan. The variance is estimated from the survey (`magtwin.field.survey.node_errors`); it
-        is None for a survey of one heading.
-
-    Raises:
-        InputError: The readings are not gridded.
+    Several good readings at one node are averaged. Nodes without one are not valid; their value is the mean
+    of the others, or nan. The variance is estimated from the survey (`magtwin.field.survey.node_errors`); it
+    is None for a survey of one heading.
     """
     if readings.grid is None or readings.node is None:
         raise InputError(
@@ -95,16 +88,8 @@ def write_survey(field: AnomalyMap, folder: str | os.PathLike[str], *, force: bo
     and y in world [m], the recorded heading, else the nominal one [rad], and the field [nT], all without
     rounding. So the CSVs of a survey are restored from its map row by row.
 
-    Args:
-        field: The map. Of its variance only the median per heading is kept, and no harmonic field.
-        folder: Folder to create.
-        force: Whether to replace an existing one.
-
-    Returns:
-        The files, one per heading.
-
-    Raises:
-        InputError: A node has no value, or the folder exists and `force` is not set.
+    Of the variance only the median per heading is kept, and no harmonic field. Returns the files, one per
+    heading.
     """
     lost = int(np.count_nonzero(~np.isfinite(field.values_nt)))
     if lost:
@@ -132,19 +117,10 @@ def read_survey(
 ) -> tuple[AnomalyMap, Report]:
     """The map of a survey folder's nodes, and its report.
 
-    Args:
-        folder: A survey folder. This and the options are those of `read_grid`.
-        keep_stuck: Whether readings of a stuck sensor stay valid nodes.
-        **options: Metadata, headings and unit.
-
-    Returns:
-        The map, in which stuck nodes are not valid (`magtwin.field.survey.stuck`). A fitted map from
-        `write_survey` is restored as it was, except that its variance is uniform per heading and its harmonic
-        field is lost. And the report: statistics of the map, deviation of recorded from nominal headings,
-        repeated readings, and what was found stuck or outlying.
-
-    Raises:
-        InputError: As `read_grid`, with file and line; or no reading is field.
+    In the map stuck nodes are not valid unless `keep_stuck`; options are those of `read_grid`. A fitted map
+    from `write_survey` is restored as it was, except that its variance is uniform per heading and its
+    harmonic field is lost. The report has statistics of the map, deviation of recorded from nominal headings,
+    repeated readings, and what was found stuck.
     """
     layers, readings = read_layers(folder, **options)
     parameters = common(layers, "parameters") or {}
@@ -166,11 +142,7 @@ def read_survey(
 
 
 def _header_lines(field: AnomalyMap, heading: int) -> list[str]:
-    """Comment lines for the file of one heading, by its index: metadata, statistics and masked rows.
-
-    Raises:
-        InputError: A parameter of the map cannot be written as JSON.
-    """
+    """Comment lines for the file of one heading, by its index: metadata, statistics and masked rows."""
     figures = {name: value for name, value in statistics(field, heading).items() if math.isfinite(value)}
     named = {name: getattr(field, name) for name in (*KEPT, "source")}
     metadata: dict[str, Any] = {name: value for name, value in named.items() if value not in ("", None)}

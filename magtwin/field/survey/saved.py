@@ -32,14 +32,6 @@ def save_readings(readings: Readings, path: str | os.PathLike[str], *, force: bo
 
     Arrow fields have unit and frame as metadata. The metadata `magtwin_readings` of the file hold, as JSON,
     the runs, the grid, the height and the source.
-
-    Args:
-        readings: The readings.
-        path: The file to make.
-        force: Replace an existing file.
-
-    Raises:
-        InputError: The file exists and `force` is not set.
     """
     fields, arrays = [], []
     for key, (width, _) in SHAPES.items():
@@ -64,11 +56,7 @@ def save_readings(readings: Readings, path: str | os.PathLike[str], *, force: bo
 
 
 def load_readings(path: str | os.PathLike[str]) -> Readings:
-    """Read readings that `save_readings` wrote, to the last bit.
-
-    Raises:
-        InputError: The file is missing, is not Parquet, is truncated, or holds no Readings.
-    """
+    """Read readings that `save_readings` wrote, to the last bit."""
     path = Path(existing(path, "Parquet file"))
     metadata = dict(load_parquet(path, pq.read_schema).metadata or {})
     table = read_table(path)

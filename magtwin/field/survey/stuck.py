@@ -70,12 +70,8 @@ NAMED = 20  # Most outliers listed in the report, the largest first
 def mask_stuck(readings: Readings) -> tuple[Readings, Report]:
     """Find the readings that are not field, and mark them as not good.
 
-    Args:
-        readings: A survey; rows that are not `good` stay so and are ignored.
-
-    Returns:
-        The readings with frozen and stuck ones no longer good; and the report: counts, the level, nodes stuck
-        at every heading, the number masked falsely, outliers with place and size.
+    Rows that are not `good` stay so and are ignored. The report has counts, the level, nodes stuck at every
+    heading and the number masked falsely.
     """
     findings = find_stuck(readings)
     good = readings.good & ~findings.frozen & ~findings.stuck

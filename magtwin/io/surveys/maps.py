@@ -44,18 +44,9 @@ def import_survey(
 ) -> Report:
     """Write a survey as a map layer, which it must be gridded for, or as readings.
 
-    Args:
-        sources: As for `read_readings`; a folder with one CSV per heading too.
-        out: Map layer (.usdc) or readings (.parquet) to write.
-        about: Metadata that the files lack.
-        force: Whether an existing output is replaced.
-        reading: Options of `survey_and_report`.
-
-    Returns:
-        A report on the field and on stuck readings.
-
-    Raises:
-        InputError: A source cannot be read, or the output cannot be written.
+    Sources are those of `read_readings`; a folder with one CSV per heading too. The output is a map layer
+    (.usdc) or readings (.parquet); `about` are metadata that the files lack, `reading` options of
+    `survey_and_report`.
     """
     out, columns, about = check_free(out, force=force), reading.get("columns") or Columns(), about or About()
     name = about.name or out.stem
@@ -93,23 +84,9 @@ def fit_survey(
 ) -> Report:
     """Fit a model to a survey and write its map with variance.
 
-    Args:
-        sources: As for `import_survey`.
-        out: Map layer to write (.usdc).
-        method: One of `magtwin.field.fit.fit.METHODS`; "auto" is the best at readings left out.
-        kernel: Covariance of the Gaussian process. None: poisson; for "auto", the better one.
-        earth_nt: The Earth's field in world axes for the harmonic fit [nT].
-        spacing_m: Spacing of the map's nodes [m]. None: chosen by accuracy.
-        headings_rad: Headings of the map [rad]. None: chosen by accuracy.
-        keep_stuck: Whether stuck and repeated readings stay in.
-        progress: Called with the number done, the total, and a word.
-        force: Whether an existing output is replaced.
-
-    Returns:
-        A report on the map, its grid, stuck readings and doubts.
-
-    Raises:
-        InputError: A source cannot be read, has too few good readings, or the output cannot be written.
+    `kernel` is the covariance of the Gaussian process (None: poisson; for "auto" the better one), `earth_nt`
+    the Earth's field in world axes for the harmonic fit. Spacing and headings are chosen by accuracy if they
+    are not given. The report is on the map, its grid, stuck readings and doubts.
     """
     from magtwin.field.fit.choice import choice_report
     from magtwin.field.fit.fit import fit, grid_report, raster
@@ -143,17 +120,8 @@ def validate_methods(
 ) -> Report:
     """Predict left-out readings of a survey with each method, and report the errors.
 
-    Args:
-        sources: As for `import_survey`.
-        methods: Methods to validate. None: all but "auto".
-        split: What is left out. None: nodes of a gridded survey, runs if there are several, else blocks.
-        kernel: Covariance of the Gaussian process. None: poisson.
-        earth_nt: The Earth's field in world axes for the harmonic fit [nT].
-        keep_stuck: Whether stuck and repeated readings stay in.
-        progress: Called with the number done, the total, and a word.
-
-    Raises:
-        InputError: A source cannot be read, or an option belongs to a method that is not validated.
+    All methods but "auto" by default. Left out are, by default, nodes of a gridded survey, runs if there are
+    several, else blocks. Further arguments are those of `fit_survey`.
     """
     from magtwin.field.fit.check import FILLED, check
     from magtwin.field.fit.fit import METHODS

@@ -53,14 +53,8 @@ def survey_and_report(
 
     Of values that a logger faster than the sensor repeated, one reading each is kept.
 
-    Args:
-        sources: As for `magtwin.io.surveys.readings.read_readings`.
-        about: Metadata that the files lack.
-        keep_stuck: Whether stuck and repeated readings stay in.
-        reading: `columns`, `pose_topic` and `field_topic` of `read_readings`.
-
-    Raises:
-        InputError: A source cannot be read, or all of its readings are stuck.
+    `reading` are `columns`, `pose_topic` and `field_topic` of `read_readings`, `about` metadata that the
+    files lack.
     """
     known = {} if about is None else {**asdict(about), "name": None}  # errors name the file
     readings = read_readings(*sources, **reading, **known)

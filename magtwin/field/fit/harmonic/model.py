@@ -89,13 +89,6 @@ class HarmonicModel(FittedModel):
         """`predict` on evenly spaced nodes, several times faster.
 
         On a fine grid the variance is computed only at nodes `COARSE` apart, and interpolated.
-
-        Args:
-            p_xy: Nodes of a grid [m], shape (Y, X, 2).
-            yaw: Heading [rad].
-
-        Returns:
-            Magnitude [nT] and its variance [nT^2], each of shape (Y, X).
         """
         value = self.field.magnitude_nt(p_xy, yaw, compiled=True)
         depth = np.abs(self.forward.p_world_dipole[:, 2] - self.forward.height_m).min()
