@@ -73,9 +73,7 @@ def check_readings(readings: Readings) -> None:
         raise InputError(f"{count} good readings {of}{masked_words(readings)}; a map needs {LEAST} at least")
     p, b = readings.p_xy[good], readings.b_nt[good]
     if np.ptp(b) == 0:
-        raise InputError(
-            f"all {count} good readings {of} are {b[0]:.10g} nT: a stuck sensor, not a field; survey again"
-        )
+        raise InputError(f"all {count} good readings {of} are {b[0]:.10g} nT: a stuck sensor; survey again")
     spans = np.linalg.svd(p - p.mean(axis=0), compute_uv=False)
     if not spans[1] > 1e-6 * spans[0] + EDGE:
         raise InputError(f"the {count} good readings {of} lie on one line; a map needs an area")

@@ -80,9 +80,7 @@ class AnomalyMap(Summarized):
     def __post_init__(self) -> None:
         values = _frozen(self.values_nt, float)
         if values.ndim != 3 or not (values.shape[0] >= 1 and min(values.shape[1:]) >= 2):
-            text = (
-                "values_nt of AnomalyMap must have shape (H, Y, X) with at least one heading and 2 x 2 nodes"
-            )
+            text = "values_nt of AnomalyMap must have shape (H, Y, X), one heading and 2 x 2 nodes or more"
             raise InputError(f"{text}, got {values.shape}")
         valid = np.ones(values.shape, bool) if self.valid is None else self.valid
         arrays: dict[str, Any] = {"values_nt": values, "valid": _frozen(valid, bool)}
@@ -115,9 +113,7 @@ class AnomalyMap(Summarized):
         for name in ("variance_nt2", "between_nt2"):
             part = getattr(self, name)
             if part is not None and not np.all(is_variance(part[..., self.valid])):
-                raise InputError(
-                    f"{name} of AnomalyMap must not be below 0, nor nan or infinite, at valid nodes"
-                )
+                raise InputError(f"{name} of AnomalyMap must not be below 0, nor nan, at valid nodes")
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, AnomalyMap):

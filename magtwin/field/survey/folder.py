@@ -122,10 +122,9 @@ def common(layers: "list[Layer]", key: str) -> Any:
     given = [layer for layer in layers if key in layer.metadata]
     for other in given[1:]:
         if other.metadata[key] != given[0].metadata[key]:
-            raise InputError(
-                f"{other.path}: {key} is {str(other.metadata[key])[:QUOTED]!r}, but "
-                f"{str(given[0].metadata[key])[:QUOTED]!r} in {given[0].path.name}; they are of two maps"
-            )
+            one, two = (repr(str(layer.metadata[key])[:QUOTED]) for layer in (other, given[0]))
+            text = f"{key} is {one}, but {two} in {given[0].path.name}; they are of two maps"
+            raise InputError(f"{other.path}: {text}")
     return given[0].metadata[key] if given else ""
 
 
@@ -151,9 +150,7 @@ def _heading(path: Path) -> float:
     except ValueError:
         heading = math.nan
     if not 0 <= heading < 360:
-        raise InputError(
-            f"{path}: a survey file is named after its heading, 0 to 359 deg, as 90{SUFFIX}; got {text!r}"
-        )
+        raise InputError(f"{path}: named after its heading, 0 to 359 deg, as 90{SUFFIX}; got {text!r}")
     return heading
 
 
@@ -171,19 +168,14 @@ def _check_headings(folder: Path, found: list[float], expected: tuple[float, ...
         count = round(360 / min(least, WIDEST_DEG))
         expected = tuple(sorted((found[0] + 360 * k / count) % 360 for k in range(count)))
         if without(found, expected):
-            raise InputError(
-                f"{folder}: headings {_degrees_of(found)} deg are not evenly spaced; "
-                "survey the missing ones, or name those that there are with headings_deg"
-            )
+            text = f"{folder}: headings {_degrees_of(found)} deg are not evenly spaced"
+            raise InputError(f"{text}; survey the others, or name these with headings_deg")
     if missing := without(expected, found):
-        raise InputError(
-            f"{folder}: heading {_degrees_of(missing)} deg missing, found {_degrees_of(found)}; "
-            f"expected {', '.join(f'{h:g}{SUFFIX}' for h in missing)}"
-        )
+        names = ", ".join(f"{h:g}{SUFFIX}" for h in missing)
+        text = f"heading {_degrees_of(missing)} deg missing, found {_degrees_of(found)}"
+        raise InputError(f"{folder}: {text}; expected {names}")
     if beyond := without(found, expected):
-        raise InputError(
-            f"{folder}: heading {_degrees_of(beyond)} deg is not among the expected {_degrees_of(expected)}"
-        )
+        raise InputError(f"{folder}: heading {_degrees_of(beyond)} deg is not in {_degrees_of(expected)}")
 
 
 def _degrees_of(headings: Sequence[float]) -> str:
@@ -206,10 +198,7 @@ def _read_layer(path: Path, heading_deg: float, unit: str, scale: float | None) 
             (label,), row = labels[role], int(lost[0])
             cell = str(table.column(label).cells[row]).strip()
             why = "".join(f"; {note}" for note in table.notes if "cut short" in note)
-            raise InputError(
-                f"{where(row)}: {label} is missing, got {cell!r}; every node needs a finite value, measure "
-                f"it or copy the file again{why}"
-            )
+            raise InputError(f"{where(row)}: {label} is missing, got {cell!r}; every node needs it{why}")
     field = nt_per(unit, scale) * values["field"]
     if len(low := np.flatnonzero(field <= 0)):
         text = f"scalar_mag is a magnitude, above 0 nT, got {field[low[0]]:g}"
@@ -296,10 +285,8 @@ def _axis(layer: Layer, label: str, values: Array) -> Array:
     odd = np.flatnonzero(np.abs(steps - usual) > 2 * GRAIN_M)
     if len(odd):
         k = odd[0]
-        raise InputError(
-            f"{layer.path}: {label} steps by {usual:g} m, but from {axis[k]:g} to {axis[k + 1]:g}; "
-            "a line of nodes is missing, or one lies off the grid"
-        )
+        text = f"{label} steps by {usual:g} m, but from {axis[k]:g} to {axis[k + 1]:g}"
+        raise InputError(f"{layer.path}: {text}; a line of nodes is missing, or one is off the grid")
     return axis
 
 
@@ -341,13 +328,11 @@ def _metadata(path: Path, lines: Sequence[tuple[int, str]]) -> dict[str, Any]:
         except (ValueError, RecursionError) as error:
             if key not in (*TEXTS, "method"):
                 raise InputError(
-                    f"{path}:{number}: {key} must be JSON, got {text[:QUOTED]!r} ({error})"
+                    f"{path}:{number}: {key} must be JSON, {text[:QUOTED]!r}: {error}"
                 ) from error
             metadata[key] = text  # written by hand, without quotes
         if not _fits(key, metadata[key]):
-            raise InputError(
-                f"{path}:{number}: {key} cannot be {text[:QUOTED]!r}; correct or remove the line"
-            )
+            raise InputError(f"{path}:{number}: {key} cannot be {text[:QUOTED]!r}; correct it")
         if key == "created":
             check_day(metadata[key], f"{path}:{number}: created")
     return metadata
