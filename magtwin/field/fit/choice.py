@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import count
 from math import lgamma
 from typing import Any
 
@@ -38,7 +39,6 @@ FREEDOM = 5.0
 # to the whole survey continues from there.
 SHORT: Mapping[str, Mapping[str, Any]] = {"harmonic": {"gain": GAIN}, "gp": {"steps": 15}}
 RESUMED = ("harmonic", "gp")  # Methods whose fits start from an earlier fit
-TICKS = 100  # Steps of progress per fit
 # Parameters of a map with the figures of the candidates, in the order of their names
 CANDIDATES, CHOSEN, LEAD = "candidates", "chosen", "lead in log score"
 RMSE, SCORE, COVERAGE = "held-out RMSE [nT]", "held-out log score", "held-out coverage [%]"
@@ -53,16 +53,14 @@ class Candidate:
     options: Mapping[str, Any] = field(default_factory=dict)
     magnitudes: bool = False  # Whether vectors are left out of the readings
 
-    def fit(
-        self, readings: Readings, progress: Progress | None, like: FieldModel | None = None, **more: Any
-    ) -> FieldModel:
+    def fit(self, readings: Readings, like: FieldModel | None = None, **more: Any) -> FieldModel:
         """Fit the readings, from an earlier fit if there is one."""
         if like is not None and self.method in RESUMED:
             more["like"] = like
         else:
             more |= SHORT.get(self.method, {})
         own = readings.with_(b_body_nt=None) if self.magnitudes else readings
-        return fit_as_given(own, self.method, progress=progress, **{**self.options, **more})
+        return fit_as_given(own, self.method, **{**self.options, **more})
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,16 +138,14 @@ def fit_auto(
     if not held:
         model = fit_as_given(readings, "harmonic", progress=progress, earth_nt=earth_nt)
         return _told(model, {CHOSEN: "harmonic: too few readings to leave some out"})
-    steps, turn = TICKS * (len(tried) + 4 * (len(held) - 1) + 2), 0
+    say, steps, turn = progress or (lambda *_: None), len(tried) + 4 * (len(held) - 1) + 2, count()
     trials, refused = list[Trial](), list[InputError]()
     for candidate in tried:
-        like = _like(candidate, trials)
+        say(next(turn), steps, f"trying {candidate.name}")
         try:
-            part = _part(progress, turn, steps, f"trying {candidate.name}")
-            trials.append(_try(candidate, *held[0], part, like))
+            trials.append(_try(candidate, *held[0], _like(candidate, trials)))
         except InputError as error:
             refused.append(error)
-        turn += 1
     if not trials:
         raise refused[-1]
     trials = _common(trials)
@@ -157,19 +153,17 @@ def fit_auto(
     for pair in held[1:]:
         more = []
         for trial in finalists:
-            part = _part(progress, turn, steps, f"trying {trial.name} again")
-            more.append(_try(trial.of[0], *pair, part, trial.models[0]))
-            turn += 1
+            say(next(turn), steps, f"trying {trial.name} again")
+            more.append(_try(trial.of[0], *pair, trial.models[0]))
         more = _common(more)
         finalists = [trial.joined(other) for trial, other in zip(finalists, more, strict=True)]
     finalists += _mixtures(finalists)
     best = max(finalists, key=lambda trial: trial.score)
     models = []
     for k, candidate in enumerate(best.of):
-        part = _part(progress, turn + k, steps, f"fitting {candidate.name}")
-        models.append(candidate.fit(readings, part, best.models[k]))
-    if progress is not None:
-        progress(steps, steps, "done")
+        say(next(turn), steps, f"fitting {candidate.name}")
+        models.append(candidate.fit(readings, best.models[k]))
+    say(steps, steps, "done")
     model = models[0] if len(models) == 1 else Mixture.of(models, best.weights)
     names = [trial.name for trial in finalists]
     trials = finalists + [trial for trial in trials if trial.name not in names]
@@ -287,12 +281,10 @@ def _like(candidate: Candidate, trials: Sequence[Trial]) -> FieldModel | None:
     return None
 
 
-def _try(
-    candidate: Candidate, rest: Readings, test: Readings, progress: Progress | None, like: FieldModel | None
-) -> Trial:
+def _try(candidate: Candidate, rest: Readings, test: Readings, like: FieldModel | None) -> Trial:
     """Fit a candidate to `rest` and predict `test`."""
     more: dict[str, Any] = {"fill": True} if candidate.method == "trilinear" else {}
-    model = candidate.fit(rest, progress, like, **more)
+    model = candidate.fit(rest, like, **more)
     mean, variance = predict_readings(model, test, candidate.method)
     variance = np.maximum(variance, np.finfo(float).tiny)
     return Trial((candidate,), mean, variance, test.b_nt - mean, models=(model,))
@@ -335,12 +327,3 @@ def _mixtures(trials: Sequence[Trial]) -> list[Trial]:
 def _told(model: FieldModel, more: Mapping[str, Any]) -> FieldModel:
     """A model whose parameters hold more."""
     return replace(model, parameters={**model.parameters, **more})  # type: ignore[type-var, no-any-return]
-
-
-def _part(progress: Progress | None, turn: int, steps: int, what: str) -> Progress | None:
-    """Progress of one fit of several."""
-    if progress is None:
-        return None
-    say = progress
-    say(turn * TICKS, steps, what)
-    return lambda done, total, _: say(turn * TICKS + int(TICKS * done / max(total, 1)), steps, what)
