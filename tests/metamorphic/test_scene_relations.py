@@ -109,13 +109,6 @@ def test_a_scene_that_is_turned_with_the_earths_field_reads_the_same():
     )
 
 
-def test_the_anomalies_of_two_scenes_add_up():
-    p = poses()[0] + (0.0, 0.0, 0.4)
-    parts = [replace(SCENE, sources=some) for some in (SOURCES[:1], SOURCES[1:])]
-    anomaly = [ambient_field_nt(scene, p) - EARTH.b_world_nt for scene in (SCENE, *parts)]
-    assert_allclose(anomaly[1] + anomaly[2], anomaly[0], rtol=1e-9, atol=ROUNDING_NT)
-
-
 def test_an_anomaly_at_twice_the_distance_needs_eight_times_the_moment():
     p = poses()[0] + (0.0, 0.0, 0.4)
 

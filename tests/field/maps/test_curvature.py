@@ -92,12 +92,6 @@ def test_masked_nodes_count_for_nothing_and_get_an_error_from_those_around():
     assert_array_equal(nothing, np.zeros((2, *hole.shape)))
 
 
-def test_two_by_two_nodes_have_the_spread_of_their_values():
-    values = 40_000 + np.array([[[0.0, 80.0], [0.0, 80.0]]])
-    error = interpolation_error_nt2(values, np.ones(values.shape, bool), [0.0])
-    assert_allclose(error[0], 1600 / 64)
-
-
 @pytest.mark.parametrize("count", [10, 500])
 @pytest.mark.parametrize(("outside", "whole"), [("nan", True), ("clamp", False)])
 def test_all_in_one_pass_are_the_bytes_of_two_in_each_way(monkeypatch, count, outside, whole):

@@ -43,31 +43,6 @@ def test_lookup_equals_scipys_interpolator_with_the_heading_axis_closed(degrees)
     assert_allclose(field.lookup(p, yaw), by_scipy(field, p, yaw), rtol=0, atol=SCIPY_NT)
 
 
-def test_nodes_give_their_values_whatever_the_number_of_turns():
-    field = field_map()
-    x, y = np.meshgrid(field.x_m, field.y_m)
-    p = np.stack([x, y], axis=-1)
-    for turns in (-3, 0, 1):
-        for layer, heading in enumerate(field.headings_rad):
-            got = field.lookup(p, heading + 2 * np.pi * turns)
-            assert_allclose(got, field.values_nt[layer], rtol=0, atol=1e-9)
-
-
-@given(st.floats(-3, 3), st.floats(-1.75, 1.75), st.floats(-50, 50), st.integers(-4, 4), st.integers(0, 3))
-@settings(max_examples=60, deadline=None)
-def test_turning_the_layers_turns_the_lookup(x, y, yaw, turns, quarter):
-    field = field_map()
-    turned = AnomalyMap(
-        values_nt=np.roll(field.values_nt, quarter, axis=0),
-        origin_m=field.origin_m,
-        cell_m=field.cell_m,
-        headings_rad=FOUR,
-    )
-    want = field.lookup((x, y), yaw)
-    got = turned.lookup((x, y), yaw + quarter * np.pi / 2 + 2 * np.pi * turns)
-    assert_allclose(got, want, rtol=0, atol=1e-8)  # 100 rad carries 1e-14 rad of rounding, times 1e4 nT/rad
-
-
 def test_outside_the_map_gives_nan_the_border_or_a_refusal():
     field = field_map(name="lab")
     p = np.array([[3.2, 0.0], [0.0, -9.0], [1.0, 1.0]])
