@@ -113,7 +113,7 @@ class AnomalyMap(Summarized):
         for name in ("variance_nt2", "between_nt2"):
             part = getattr(self, name)
             if part is not None and not np.all(is_variance(part[..., self.valid])):
-                raise InputError(f"{name} of AnomalyMap must not be below 0, nor nan, at valid nodes")
+                raise InputError(f"{name} of AnomalyMap must not be below 0, nan or infinite where valid")
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, AnomalyMap):
