@@ -81,7 +81,6 @@ REFUSALS = [
     ("map fit points.csv --spacing-m 1e300 --out new.usdc", "--spacing-m 1e+300 leaves no cell"),
     ("map fit points.csv --spacing-m inf --out new.usdc", "--spacing-m must be above 0 m, got inf"),
     (f"map fit points.csv --headings-deg {MANY} --out new.usdc", "--headings-deg names 3,600"),
-    ("map validate points.csv --within-m -1", "--within-m must be 0 m or more"),
     (f"map survey lab --readings {HUGE} --out new.usdc", "--readings must be at least 1 and at most 100,000"),
     ("map survey lab --heading-error-deg 1e300 --out new.usdc", "--heading-error-deg must be from 0 to 90"),
     ("map survey lab --spacing-m 0 --out new.usdc", "--spacing-m must be above 0 m"),

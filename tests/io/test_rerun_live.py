@@ -47,28 +47,32 @@ def test_where_no_viewer_listens_is_refused(address, words):
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("settings", "options", "words"),
     [
-        (["--viewer", "rerun+http://127.0.0.1:9/proxy"], "no viewer"),
-        (["--pace", "2"], "--pace"),
-        (["--live", "--pace", "0"], "--pace"),
-        (["--live", "--viewer", "rerun+http://127.0.0.1:9/proxy"], "give one"),
-        (["--out-unit", "nT"], "for a bag"),
-        (["--usd-fps", "10"], "for a USD layer"),
+        ({"VIEWER": "rerun+http://127.0.0.1:9/proxy"}, [], "no viewer"),
+        ({"PACE": "2"}, [], "pace"),
+        ({"PACE": "0"}, ["--live"], "pace"),
+        ({"VIEWER": "rerun+http://127.0.0.1:9/proxy"}, ["--live"], "give one"),
+        ({"OUT_UNIT": "nT"}, [], "for a bag"),
+        ({"USD_FPS": "10"}, [], "for a USD layer"),
     ],
 )
 def test_options_that_cannot_be_are_refused_before_anything_is_written(
-    options, words, lab_scene, tmp_path, capsys
+    settings, options, words, lab_scene, tmp_path, monkeypatch, capsys
 ):
+    for name, value in settings.items():
+        monkeypatch.setenv(f"MAGTWIN_RUN_{name}", value)
     with pytest.raises(SystemExit):
         main(["run", str(lab_scene), "--network", "none", "--out", str(tmp_path / "out"), *options])
     assert words in capsys.readouterr().err.splitlines()[-1]
     assert not list(tmp_path.iterdir())
 
 
-def test_a_viewer_that_does_not_answer_costs_no_output(lab_scene, tmp_path, capsys):
-    words = ["--network", "none", "--duration-s", "1", "--pace", "50", "--viewer", deaf_address()]
-    main(["run", str(lab_scene), *words, "--out", str(tmp_path / "out"), "--json"])
+def test_a_viewer_that_does_not_answer_costs_no_output(lab_scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("MAGTWIN_RUN_PACE", "50")
+    monkeypatch.setenv("MAGTWIN_RUN_VIEWER", deaf_address())
+    words = ["--network", "none", "--duration-s", "1", "--out", str(tmp_path / "out")]
+    main(["run", str(lab_scene), *words, "--json"])
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["run.parquet", "run.png", "run.rrd"]
     table = read_run(tmp_path / "out" / "run.parquet")
     assert np.array_equal(read_run(tmp_path / "out" / "run.rrd")["b_total_nt"], table["b_total_nt"])

@@ -252,7 +252,7 @@ def test_an_open_path_is_driven_back_and_forth(nodes: Callable[..., Bus]) -> Non
 
 def test_a_path_is_driven_with_stamped_commands(nodes: Callable[..., Bus]) -> None:
     robot = Ideal(nodes, "geometry_msgs/msg/TwistStamped")
-    node, bus = started(robot, nodes, speed=0.3, commands="TwistStamped", controller="release")
+    node, bus = started(robot, nodes, speed=0.3, commands="TwistStamped")
     while not node.done and robot.t < 20:
         robot.tick(bus, 5)
     np.testing.assert_allclose((robot.x, robot.y), LINE.p_xy[-1], atol=0.03)
