@@ -21,11 +21,11 @@ PACKAGE = ROOT / "magtwin"
 PAGE = ROOT / "ARCHITECTURE.md"
 
 FILES = {
-    "scene_to_recording": 200,
-    "survey_to_map": 200,
-    "recordings_to_network": 200,
-    "localizer_to_row": 200,
-    "urdf_to_usd": 200,
+    "scene_to_recording": 130,
+    "survey_to_map": 60,
+    "recordings_to_network": 62,
+    "localizer_to_row": 105,
+    "urdf_to_usd": 60,
 }
 """Most files of each walk."""
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
@@ -73,13 +72,13 @@ class Player:
     """"none" for charts alone."""
 
     note: str = ""
-    style = Markup((Path(__file__).parent / "player.css").read_text(encoding="utf-8"))
-    script = Markup((Path(__file__).parent / "player.js").read_text(encoding="utf-8"))
+    style = (Path(__file__).parent / "player.css").read_text(encoding="utf-8")
+    script = (Path(__file__).parent / "player.js").read_text(encoding="utf-8")
 
     @property
     def script_hash(self) -> str:
         """Source of the script in the page's content security policy: no other script runs."""
-        return Markup("sha256-" + base64.b64encode(hashlib.sha256(self.script.encode()).digest()).decode())
+        return "sha256-" + base64.b64encode(hashlib.sha256(self.script.encode()).digest()).decode()
 
 
 def player_of(
