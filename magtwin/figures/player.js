@@ -119,7 +119,7 @@ function words(data, clock) {
   const a = data.arrays;
   const shown = [["time", () => `${said(a.t[clock.row] / 100, 2)} s`]];
   if (a.reading) shown.push(["field", (i) => (a.reading[i] === UNKNOWN ? "unknown" : `${said(a.reading[i] / 100, 2)} µT`)]);
-  if (a.trail) shown.push(["minus map", (i) => (a.trail[i] === UNKNOWN ? "unknown" : `${said(a.trail[i], 0)} nT`)]);
+  if (a.trail) shown.push(["reading − map", (i) => (a.trail[i] === UNKNOWN ? "unknown" : `${said(a.trail[i], 0)} nT`)]);
   if (a.yaw) shown.push(["heading", (i) => (a.yaw[i] === UNKNOWN ? "unknown" : `${said((((a.yaw[i] / 10) % 360) + 360) % 360, 1)}°`)]);
   const list = at("now");
   const cells = shown.map(([name, text]) => {
@@ -196,7 +196,7 @@ function svg(tag, attributes, text) {
 }
 
 function charts(data, clock) {
-  const drawn = data.charts.map((chart, k) => new Chart(chart, data, clock, k === data.charts.length - 1));
+  const drawn = data.charts.map((chart, k) => new Chart(chart, data, clock, k));
   at("charts").append(...drawn.map((chart) => chart.box));
   const draw = () => { for (const chart of drawn) chart.draw(); };
   new ResizeObserver(draw).observe(at("charts"));
@@ -204,8 +204,8 @@ function charts(data, clock) {
 }
 
 class Chart {
-  constructor(chart, data, clock, last) {
-    Object.assign(this, { chart, data, clock, last });
+  constructor(chart, data, clock, number) {
+    Object.assign(this, { chart, data, clock, number, last: number === data.charts.length - 1 });
     this.box = element("figure", "");
     const title = document.createElement("figcaption");
     title.append(element("b", `${chart.title} [${chart.unit}]${chart.band ? ", 90 % band" : ""}`));
@@ -256,8 +256,9 @@ class Chart {
     hole.append(svg("rect", { x: LEFT, y: TOP, width: Math.max(1, width - LEFT - RIGHT), height: Math.max(1, bottom - TOP) }));
     parts.push(hole);
     if (this.column("lidar")) for (const [a, b] of spans(this.column("lidar"))) {
-      const left = this.x(t[a] / 100);
-      parts.push(svg("rect", { class: "lidar", x: left, y: TOP, width: this.x(t[b] / 100) - left, height: bottom - TOP }));
+      const left = this.x(t[a] / 100), wide = this.x(t[b] / 100) - left;
+      parts.push(svg("rect", { class: "lidar", x: left, y: TOP, width: wide, height: bottom - TOP }));
+      if (!this.number && wide > 60) parts.push(svg("text", { x: left + 4, y: bottom - 4 }, "LiDAR on"));
     }
     for (const value of ticks(low, high, Math.max(4, Math.floor((bottom - TOP) / 36)))) {
       parts.push(svg("line", { class: "grid", x1: LEFT, x2: width - RIGHT, y1: this.y(value), y2: this.y(value) }));

@@ -109,7 +109,7 @@ def test_a_browser_plays_a_run_and_shows_the_values_of_its_row(run, twin, lab_sc
     row = int(np.searchsorted(np.round(run["t"] * 100), 4540 + 1e-6, side="right")) - 1
     shown = dict(re.findall(r"<dt>([^<]+)</dt><dd>([^<]+)</dd>", document))
     assert shown["field"] == f"{run['b_measured_nt'][row] / 1000:.2f} µT"
-    assert shown["minus map"] == f"{run['b_measured_nt'][row] - run['b_map_nt'][row]:,.0f} nT".replace(
+    assert shown["reading − map"] == f"{run['b_measured_nt'][row] - run['b_map_nt'][row]:,.0f} nT".replace(
         "-", "−"
     )
     outputs = re.findall(r"<output>([^<]+)</output>", document)
