@@ -260,7 +260,7 @@ class Chart {
       parts.push(svg("rect", { class: "lidar", x: left, y: TOP, width: wide, height: bottom - TOP }));
       if (!this.number && wide > 60) parts.push(svg("text", { x: left + 4, y: bottom - 4 }, "LiDAR on"));
     }
-    for (const value of ticks(low, high, Math.max(4, Math.floor((bottom - TOP) / 36)))) {
+    for (const value of ticks(low, high, Math.max(5, Math.floor((bottom - TOP) / 36)))) {
       parts.push(svg("line", { class: "grid", x1: LEFT, x2: width - RIGHT, y1: this.y(value), y2: this.y(value) }));
       parts.push(svg("text", { x: LEFT - 6, y: this.y(value) + 4, "text-anchor": "end" }, short(value)));
     }
