@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from functools import partial
 from pathlib import Path
 
@@ -80,20 +81,17 @@ def test_a_killed_chunk_is_tried_two_more_times(tmp_path, times, failed):
 
 
 def test_a_worker_that_is_killed_from_outside_is_replaced(tmp_path):
+    def kill() -> None:
+        wait_until(lambda: list(tmp_path.glob("2-*")))
+        os.kill(int(next(tmp_path.glob("2-*")).name.partition("-")[2]), signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
     with open_pool(2) as pool:
-        killed = []
-
-        def limit(x):  # asked while chunks are worked on
-            for mark in tmp_path.glob("2-*"):
-                if not killed:
-                    killed.append(int(mark.name.partition("-")[2]))
-                    os.kill(killed[0], signal.SIGKILL)
-            return PATIENCE_S
-
         work = partial(chunk_work.waits_to_be_killed, str(tmp_path), 2)
-        outcomes = list(pool.run(work, range(6), limit_s=limit))
+        outcomes = list(pool.run(work, range(6), limit_s=PATIENCE_S))
+    killer.join()
     assert sorted(o.result() for o in outcomes) == list(range(6))
-    assert killed
     assert len(list(tmp_path.glob("2-*"))) == 2
 
 
@@ -122,6 +120,7 @@ def test_processes_that_a_task_has_started_end_with_it(tmp_path):
 
 SCRIPT = """
 import sys
+import threading
 from functools import partial
 import chunk_work
 from magtwin.parallel import open_pool
