@@ -327,9 +327,7 @@ def _metadata(path: Path, lines: Sequence[tuple[int, str]]) -> dict[str, Any]:
             metadata[key] = json.loads(text, parse_constant=_no_number)
         except (ValueError, RecursionError) as error:
             if key not in (*TEXTS, "method"):
-                raise InputError(
-                    f"{path}:{number}: {key} must be JSON, {text[:QUOTED]!r}: {error}"
-                ) from error
+                raise InputError(f"{path}:{number}: {key} must be JSON, got {text[:QUOTED]!r}") from error
             metadata[key] = text  # written by hand, without quotes
         if not _fits(key, metadata[key]):
             raise InputError(f"{path}:{number}: {key} cannot be {text[:QUOTED]!r}; correct it")
