@@ -164,11 +164,11 @@ REFUSALS = {
     ),
     "heading unnamed": (
         {"west_map.csv": ""},
-        r"west_map\.csv: a survey file is named after its heading.*'west'",
+        r"west_map\.csv: named after its heading.*'west'",
     ),
     "heading of a full turn": (
         {"360_map.csv": ""},
-        r"360_map\.csv: a survey file is named after .*got '360'",
+        r"360_map\.csv: named after its heading.*got '360'",
     ),
     "heading twice": ({"90.0_map.csv": ""}, r"heading 90 has two files, the other is 90\.0_map\.csv"),
     "empty file": ({"90_map.csv": " \n"}, r"90_map\.csv: empty; expected the line '# x,y,theta,scalar_mag'"),
