@@ -1,5 +1,4 @@
-// Player: plays a run in its lab. Reads the block of data that player.py packs, and draws it with WebGL 2 and SVG.
-// Nothing is fetched, and nothing is drawn while nothing changes.
+// Player: plays a run in its lab, from the block of data that player.py packs. Draws only what changes; fetches nothing.
 (() => {
 "use strict";
 
@@ -199,6 +198,7 @@ function charts(data, clock) {
   const drawn = data.charts.map((chart, k) => new Chart(chart, data, clock, k));
   at("charts").append(...drawn.map((chart) => chart.box));
   const draw = () => { for (const chart of drawn) chart.draw(); };
+  draw();
   new ResizeObserver(draw).observe(at("charts"));
   clock.wanting.push(() => { for (const chart of drawn) chart.point(); });
 }
@@ -471,7 +471,7 @@ function stage(data, clock) {
 
   const models = () => lab.map((body) => {
     if (!body.moves) return SAME;
-    const [x, y, yaw, wheel] = ["x", "y", "yaw", body.side].map((name) => a[body.of + name] && clock.value(a[body.of + name]));
+    const [x, y, yaw, wheel] = ["x", "y", "yaw", body.side].map((name) => a[name] && clock.value(a[name]));
     if (x === undefined || x === UNKNOWN) return null;
     const base = rigid(about([0, 0, 1], ((yaw || 0) * Math.PI) / 1800), [x / 1000, y / 1000, 0]);
     return body.axis ? times(times(base, rigid(body.q, body.p)), rigid(about(body.axis, (wheel || 0) / 100), [0, 0, 0])) : base;

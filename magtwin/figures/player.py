@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import colour_limits
+from magtwin.figures.scenery import links_of, sides_of
 from magtwin.frames import matrix_from_quat, yaw_from_quat
 from magtwin.report.verdict import Z_90, Tally
 from magtwin.run.compare import HEADINGS, POSITIONS
@@ -43,9 +43,6 @@ MOST_HARMONICS, ENOUGH_NT = 4, 5.0
 
 MAP_PRIM = "/AnomalyMap"
 """Part of the paths of prims that the page draws itself, as its floor."""
-
-MOTION = ("x", "y", "yaw", "left", "right")
-"""Columns of the motion of other robots."""
 
 CHARTS: tuple[dict[str, Any], ...] = (
     {"title": "Field", "unit": "µT", "scale": 0.01, "digits": 2, "lines": ("reading", "map")},
@@ -81,9 +78,7 @@ class Player:
         return "sha256-" + base64.b64encode(hashlib.sha256(self.script.encode()).digest()).decode()
 
 
-def player_of(
-    run: Run, field: AnomalyMap | None, stage: Path | None, *, still: bytes = b"", others: Sequence[Run] = ()
-) -> Player:
+def player_of(run: Run, field: AnomalyMap | None, stage: Path | None, *, still: bytes = b"") -> Player:
     """What plays a run in its lab; the same for the same arguments, to the byte.
 
     Args:
@@ -91,7 +86,6 @@ def player_of(
         field: Its map, or None.
         stage: Its scene, or None: the map alone is shown.
         still: Picture (PNG) for where the lab cannot be drawn.
-        others: Runs of the other robots of the scene, on the same clock.
     """
     rows = rows_shown(run)
     arrays, names = columns_of(run, rows)
@@ -107,16 +101,9 @@ def player_of(
     if field is not None:
         head["map"], arrays["floor"], arrays["known"] = floor_of(field)
     if stage is not None:
-        for k, other in enumerate(others, 1):
-            seen = other.resample(run["t"][rows])
-            arrays |= {
-                f"{k}.{name}": values
-                for name, values in columns_of(seen, slice(None))[0].items()
-                if name in MOTION
-            }
-        head["scene"], left_out = scene_of(arrays, stage, [run, *others])
+        head["scene"], left_out = scene_of(arrays, stage, run)
         notes += [f"{left_out:,} small shapes of the scene are left out."] if left_out else []
-    place = f"The lab with the robot{'s' * bool(others)} and the driven path" if stage else "The driven path"
+    place = "The lab with the robot and the driven path" if stage else "The driven path"
     alt = f"{place} on the map of the field." if field else f"{place}."
     shown = "lab" if "x" in arrays else "none"
     return Player(packed(head, arrays), figures_of(run), alt, still, shown, " ".join(notes))
@@ -253,27 +240,20 @@ def floor_of(field: AnomalyMap) -> tuple[dict[str, Any], Integers, Integers]:
     return place | size | colours, integers(parts, 1), np.asarray(known, np.int32)
 
 
-def scene_of(arrays: dict[str, Array], stage: Path, runs: Sequence[Run]) -> tuple[dict[str, Any], int]:
-    """The bodies of a scene: what stands still, each robot, and each of its wheels.
+def scene_of(arrays: dict[str, Array], stage: Path, run: Run) -> tuple[dict[str, Any], int]:
+    """The bodies of a scene: what stands still, the robot, and each of its wheels.
 
     Adds the points of each body to `arrays`, in 1/65535 of its box, its faces and colours.
 
     Returns:
         The bodies with boxes, poses and axes; and the number of shapes that are left out.
     """
-    opened = open_scene(stage, check_network=False, lab=str(runs[0].metadata.get("lab", "")))
-    links, scene = read_links(opened.stage), opened.scene
-    placed = {p.robot.name: p.robot for p in scene.robots}
-    bases = list(dict.fromkeys(link.base for link in links.values() if link.joint))
-    robots = {}  # number of the run, and columns of the wheels, by base
-    for k, run in enumerate(runs):
-        name = str(run.metadata.get("robot", next(iter(placed))))
-        if name not in placed or not bases:
-            raise InputError(f"{stage}: has no robot {name}")
-        at = list(placed).index(name) if len(placed) == len(bases) else 0
-        robots[bases[at]] = (f"{k}." if k else "", placed[name].drive.sides)
+    opened = open_scene(stage, check_network=False, lab=str(run.metadata.get("lab", "")))
+    links = read_links(opened.stage)
+    moving = links_of(links, [placed.robot.name for placed in opened.scene.robots], run)
+    sides = sides_of(opened.scene, run)
     bodies: dict[str, list[Any]] = {}
-    about: dict[str, dict[str, Any]] = {"lab": {"moves": False}}
+    about: dict[str, dict[str, Any]] = {"lab": {"moves": False}, "robot": {"moves": True}}
     shapes = [s for s in read_shapes(opened.stage) if MAP_PRIM not in s.prim and len(s.faces)]
     room, left_out = MOST_TRIANGLES, 0
     for shape in sorted(shapes, key=lambda shape: -float(np.ptp(shape.vertices, axis=0).max())):
@@ -283,24 +263,15 @@ def scene_of(arrays: dict[str, Array], stage: Path, runs: Sequence[Run]) -> tupl
             left_out += 1
             continue
         link, name = links.get(shape.link), "lab"
-        if link is not None and link.base not in robots:
+        if link is not None and shape.link not in moving:
             points = points @ np.asarray(matrix_from_quat(link.q_world_link_xyzw)).T + link.p_world_link
+        elif link is not None and link.joint in sides and link.rolling_axis is not None:
+            name, side = shape.link, ("left", "right")[sides[link.joint]]
+            pose = {"p": link.p_base_link, "q": link.q_base_link_xyzw, "axis": link.rolling_axis}
+            about[name] = {"moves": True, "side": side, **pose}
         elif link is not None:
-            of, sides = robots[link.base]
-            name = f"{of}robot"
-            about[name] = {"moves": True, "of": of}
-            if link.joint in sides and link.rolling_axis is not None:
-                name = f"{of}{shape.link}"
-                turns = {"side": ("left", "right")[sides[link.joint]], "axis": link.rolling_axis}
-                about[name] = {
-                    "moves": True,
-                    "of": of,
-                    "p": link.p_base_link,
-                    "q": link.q_base_link_xyzw,
-                    **turns,
-                }
-            else:
-                points = points @ np.asarray(matrix_from_quat(link.q_base_link_xyzw)).T + link.p_base_link
+            name = "robot"
+            points = points @ np.asarray(matrix_from_quat(link.q_base_link_xyzw)).T + link.p_base_link
         bodies.setdefault(name, []).append((shape, points, faces))
     made = [{"name": name, **about[name], **pack_body(arrays, name, parts)} for name, parts in bodies.items()]
     return {"bodies": made}, left_out

@@ -38,6 +38,7 @@ from magtwin.frames import matrix_from_quat, quat_from_yaw
 from magtwin.run.compare import FIELDS, HEADINGS, POSITIONS
 from magtwin.run.run import Run
 from magtwin.spec.base import Vec3
+from magtwin.spec.scene import Scene
 from magtwin.usd.geometry import ColourScale, Link, Shape, read_colour_scale, read_links, read_shapes
 from magtwin.usd.scene import open_scene
 
@@ -162,9 +163,8 @@ class Scenery:
         opened = open_scene(scene_file, check_network=False, lab=str(run.metadata.get("lab", "")))
         stage, scene = opened.stage, opened.scene
         shapes, links = read_shapes(stage), read_links(stage)
-        moving = _links_of(links, [placed.robot.name for placed in scene.robots], run)
-        drive = scene.led_by(str(run.metadata["robot"])).robot.drive if scene.others else scene.robot.drive
-        self._sides = drive.sides
+        moving = links_of(links, [placed.robot.name for placed in scene.robots], run)
+        self._sides = sides_of(scene, run)
         still = [shape for shape in shapes if shape.link not in moving]
         if not shapes:
             raise InputError(f"{scene_file}: shows nothing")
@@ -376,7 +376,7 @@ def _position(run: Run) -> str:
     raise InputError(f"the run has no positions: it has none of {', '.join(POSITIONS)}")
 
 
-def _links_of(links: Mapping[str, Link], robots: Sequence[str], run: Run) -> dict[str, Link]:
+def links_of(links: Mapping[str, Link], robots: Sequence[str], run: Run) -> dict[str, Link]:
     """Links of the robot of a run; other robots of the scene stand still.
 
     Raises:
@@ -390,6 +390,12 @@ def _links_of(links: Mapping[str, Link], robots: Sequence[str], run: Run) -> dic
         raise InputError(f"the metadata of the run name no robot of the scene, which has {', '.join(robots)}")
     base = bases[robots.index(name)] if len(robots) == len(bases) and name in robots else bases[0]
     return {name: link for name, link in links.items() if link.base == base}
+
+
+def sides_of(scene: Scene, run: Run) -> Mapping[str, int]:
+    """Columns of `wheel_angle` by the names of the joints of the driven wheels of a run's robot."""
+    placed = scene.led_by(str(run.metadata["robot"])) if scene.others else scene
+    return placed.robot.drive.sides
 
 
 def _steps(p_xy: Array) -> NDArray[np.intp]:
