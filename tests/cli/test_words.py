@@ -13,7 +13,7 @@ from magtwin.cli.words import GROUPS, OLD, as_of_today, guess, option_meant
 load()
 MEANT = {
     "run": "simulate sim simulation drive-path simulate-robot physics runSim",
-    "plot": "draw image images charts graph video movie animate screenshot plot-map plotmap render make-video",
+    "plot": "draw image images charts graph video movie animate screenshot plot-map plotmap make-video",
     "view": "open show visualize visualise gui watch show-run",
     "info": "list ls describe inspect cat metadata",
     "robot": "urdf2usd import-urdf urdf-to-usd robot2usd usd2urdf convert-robot xacro urdftousd",
