@@ -33,18 +33,11 @@ OLD_OPTIONS = {"--time-s": "--at", "--quantity": "--show"}
 
 _words = re.compile("[a-z]+").findall
 
-LESS = {
-    **dict.fromkeys(
-        _words(
-            "scene robot map run model dataset data ros room lab world network file field stage report path "
-            "mapping usd weights sensor magnetic grid collect magnetometer"
-        ),
-        0.5,
-    ),
-    **dict.fromkeys(_words("build make create generate write add start use"), 0.4),
-}
-"""Words that decide less than others: what is acted on, and any action; and how much less."""
-
+_NOUNS = _words(
+    "scene robot map run model dataset data ros room lab world network file field stage report path mapping "
+    "usd weights sensor magnetic grid collect magnetometer"
+)
+_ACTIONS = _words("build make create generate gen mk write add start use")
 _FILLERS = frozenset(_words("to the a an my of from for with and in into by as on it magtwin me this please"))
 
 _ENDINGS = _words("ations ation ating ators ator ated ates ate ings ing ions ion ers er ors or es ed s e")
@@ -57,6 +50,10 @@ def stem(word: str) -> str:
             word = word.removesuffix(ending)
             break
     return word[:-1] if len(word) > 3 and word[-1] == word[-2] else word
+
+
+LESS = dict.fromkeys(map(stem, _NOUNS), 0.5) | dict.fromkeys(map(stem, _ACTIONS), 0.4)
+"""Words that decide less than others: what is acted on, and any action; and how much less."""
 
 
 @cache
@@ -89,7 +86,7 @@ def _vocabulary() -> tuple[dict[str, dict[str, float]], dict[str, list[frozenset
             for part in word.split("-"):
                 known = single.setdefault(stem(part), {})
                 if part == word:
-                    weight *= 1.0 if word in groups else LESS.get(word, 1.0)
+                    weight *= 1.0 if word in groups else LESS.get(stem(word), 1.0)
                     known[command] = max(known.get(command, 0.0), weight)
         pairs = (
             *(word.split("-") for word in text.split() if "-" in word),
@@ -126,7 +123,7 @@ def _known(word: str, single: dict[str, dict[str, float]]) -> list[str]:
     """The stems of a word, of a compound's parts, or of the nearest word that is spelled otherwise."""
     if stem(word) in single:
         return [stem(word)]
-    for k in range(3, len(word) - 2):
+    for k in range(2, len(word) - 2):
         for second in (word[k:], word[k:].removeprefix("to"), word[k:].removeprefix("2")):
             if stem(word[:k]) in single and stem(second) in single:
                 return [stem(word[:k]), stem(second)]
