@@ -155,11 +155,11 @@ def _doubts(readings: Readings, source: Source) -> list[str]:
         doubts.append(line)
     doubts += [*heading_doubts(readings), *vector_doubts(readings)]
     mean = np.exp(1j * yaw).mean()
-    if np.abs(mean) >= ONE_HEADING:
+    if np.abs(mean) >= ONE_HEADING and not readings.by_hand:
         doubts.append(
-            f"one heading only, {np.degrees(np.angle(mean)):.0f} deg: unless the sensor was carried by hand, "
-            "the robot's own field cannot be separated from the room's, and a simulated robot adds its own "
-            "again; survey in several headings"
+            f"one heading only, {np.degrees(np.angle(mean)):.0f} deg: the robot's own field cannot "
+            "be separated from the room's, and a simulated robot adds its own again; survey in several headings, "
+            "or give --heading none if the sensor was carried by hand"
         )
     return doubts
 
@@ -206,7 +206,7 @@ def _shared(readings: Readings, method: str) -> list[str]:
             f"the room's field; the standard deviations hold {offset:g} nT for it (offset sd), which "
             "localization takes for an unknown bias; survey at rest, node by node, for a smaller one"
         )
-    elif readings.t is not None:
+    elif readings.t is not None and not readings.by_hand:
         doubts.append(
             "readings of drives: the standard deviations do not hold what the robot adds alike in all runs "
             "(motors, battery, LiDAR); survey at rest, node by node, for intervals that hold"

@@ -62,7 +62,7 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
         text = f"no row is complete; all {len(known)} have a cell that is empty or nan"
         raise InputError(f"{table.path}: {text}")
     _check_places(table, columns, p, known, taken)
-    turn = _upright(table, columns, turn, vector, known)
+    turn = _upright(table, columns, turn, known)
     _check_field(table, columns, told, p, b, known, taken)
     if vector is not None:
         _check_vectors(table, columns, vector[known], b[known], turn[known])
@@ -74,6 +74,7 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
         b_nt=b[known],
         b_body_nt=vector,
         t=None if t is None else t[known],
+        by_hand=columns.heading == NO_HEADING,
         runs=(name,),
         name=name,
         source=source + left_out(known) + "".join(notes),
@@ -94,6 +95,9 @@ def _complete(table: Table, told: Columns) -> tuple[Columns, list[str]]:
         columns = replace(columns, heading="".join(table.find("heading")))
     if columns.quaternion:
         columns = _in_order(table, columns, taken)
+    if not columns.heading and not columns.quaternion and columns.axes != "world":
+        columns = replace(columns, heading=NO_HEADING)
+        taken.append("no heading, so the sensor as carried by hand, alike at all headings (--heading)")
     if not columns.field and not columns.vector:
         columns = _with_field(table, columns, taken)
     _check_roles(table, columns)
@@ -254,19 +258,9 @@ def _check_places(
         )
 
 
-def _upright(
-    table: Table, columns: Columns, turn: Array | None, vector: Array | None, known: NDArray[np.bool_]
-) -> Array:
+def _upright(table: Table, columns: Columns, turn: Array | None, known: NDArray[np.bool_]) -> Array:
     """Headings, or quaternions of length 1; zeros for a sensor that was carried by hand."""
     if turn is None:
-        if columns.heading != NO_HEADING if vector is None else columns.axes != "world":
-            none = "if the sensor was carried by hand, give --heading none"
-            if vector is not None:
-                none += "; vectors in world axes need none (--axes world)"
-            raise InputError(
-                f"{table.path}: no heading: no column is called heading, yaw, theta; {none}; else name it "
-                "with --heading or --quaternion"
-            )
         return np.zeros(len(known))
     if turn.ndim == 1:
         return turn
