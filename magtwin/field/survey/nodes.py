@@ -77,7 +77,7 @@ def node_map(readings: Readings) -> AnomalyMap:
     """
     if readings.grid is None or readings.node is None:
         raise InputError(
-            f"survey {readings.name!r} is not gridded, so that its nodes make no map; fit a model to it (fit_map)"
+            f"survey {readings.name!r} is not gridded, so that its nodes make no map; fit one to it (fit_map)"
         )
     grid = readings.grid
     flat = np.ravel_multi_index(tuple(readings.node.T), grid.shape)

@@ -190,8 +190,8 @@ def _doubts(readings: Readings) -> list[str]:
     if np.abs(mean) >= ONE_HEADING and not readings.by_hand:
         doubts.append(
             f"one heading only, {np.degrees(np.angle(mean)):.0f} deg: the robot's own field cannot "
-            "be separated from the room's, and a simulated robot adds its own again; survey in several headings, "
-            "or give --heading none if the sensor was carried by hand"
+            "be separated from the room's, and a simulated robot adds its own again; survey in several "
+            "headings, or give --heading none if the sensor was carried by hand"
         )
     return doubts
 

@@ -14,8 +14,9 @@ from magtwin.field.units import NT_PER, check_unit, nt_per, unit_by_size
 from magtwin.frames import yaw_from_quat
 from magtwin.io.surveys.axes import levelled, other_axes
 from magtwin.io.surveys.columns import NO_HEADING, Columns
-from magtwin.tables.labels import is_on_earth, split_label, unit_of
-from magtwin.tables.quantities import ANGLES, DEGREES, FIELDS
+from magtwin.io.surveys.places import on_tangent_plane
+from magtwin.tables.labels import is_on_earth, meaning_of, split_label, unit_of
+from magtwin.tables.quantities import ANGLES, CLOCKWISE, DEGREES, FIELDS
 from magtwin.tables.table import Table, since_1970
 
 Array = NDArray[np.float64]
@@ -44,7 +45,7 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
             line), no unit fits, or columns contradict each other.
     """
     columns, taken = _complete(table, told)
-    p = np.column_stack([table.numbers(columns.x, "x"), table.numbers(columns.y, "y")])
+    p, datum = _positions(table, columns, taken)
     turn = _turn(table, columns)
     vector, b = _field(table, columns)
     if turn is None and columns.heading == NO_HEADING and vector is not None and columns.axes != "world":
@@ -75,6 +76,8 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
         b_body_nt=vector,
         t=None if t is None else t[known],
         by_hand=columns.heading == NO_HEADING,
+        frame="world: x east, y north" if datum else "",
+        datum=datum,
         runs=(name,),
         name=name,
         source=source + left_out(known) + "".join(notes),
@@ -103,7 +106,11 @@ def _complete(table: Table, told: Columns) -> tuple[Columns, list[str]]:
     _check_roles(table, columns)
     if columns.heading_unit is None and columns.heading not in ("", NO_HEADING):
         angle = table.unit(columns.heading, "heading")
-        if angle in ANGLES:
+        meaning = meaning_of(table.column(columns.heading).name, "heading")
+        if meaning and meaning.name in CLOCKWISE:
+            columns = replace(columns, heading_unit="compass")
+            taken.append(f"{columns.heading} clockwise from north, by its name (--heading-unit)")
+        elif angle in ANGLES:
             columns = replace(columns, heading_unit="deg" if angle in DEGREES else "rad")
             taken.append(f"{columns.heading} in {columns.heading_unit}, by its name (--heading-unit)")
     if columns.unit is None and columns.scale is None:
@@ -123,27 +130,38 @@ def _complete(table: Table, told: Columns) -> tuple[Columns, list[str]]:
 
 
 def _placed(table: Table, told: Columns, taken: list[str]) -> Columns:
-    """Columns with those of x and y found by name; refuses latitude and longitude."""
+    """Columns with those of x and y found by name, else those of longitude and latitude."""
     used = {told.field, *told.several("vector")}
     labels = [told.x or "".join(table.find("x", apart=used)), told.y or "".join(table.find("y", apart=used))]
     if not (told.x or told.y):
         labels = table.find("x", "y", apart=used) or table.find("x", "y")
-    names = [table.column(label).name for label in labels if label]
-    on_earth = list(filter(is_on_earth, names if all(labels) and labels else table.names))
-    if len(on_earth) > 1:
-        shown = " and ".join(repr(label) for label in on_earth[:2])
-        text = f"{shown} are latitude and longitude; give x,y in metres in the axes of the lab"
-        raise InputError(f"{table.path}: {text}")
+        labels = table.find("lon", "lat") if not labels or any(map(is_on_earth, labels)) else labels
     if not labels or not all(labels):
         raise InputError(
-            f"{table.path}: no column of x and of y {_seen(table)}; name both: --x NAME --y NAME"
+            f"{table.path}: no column of x and of y {_seen(table)}; name both: --x NAME --y NAME; or write "
+            "down when you passed which places, as t,x,y, and give that file: --waypoints FILE"
         )
     columns = replace(told, x=labels[0], y=labels[1])
+    if is_on_earth(table.column(columns.x).name):
+        return columns
     notes = table.taken({"x": columns.x, "y": columns.y})
     taken += [note for note in notes if "by the units" in note]
     if not (told.x or told.y):
         taken += [f"{note} (--x, --y)" for note in notes if note.endswith(" as x and y")]
     return columns
+
+
+def _positions(table: Table, columns: Columns, taken: list[str]) -> tuple[Array, str]:
+    """Positions [m], shape (N, 2), and the origin of those that were longitudes and latitudes."""
+    if not is_on_earth(table.column(columns.x).name):
+        return np.column_stack([table.numbers(columns.x, "x"), table.numbers(columns.y, "y")]), ""
+    degrees = [table.numbers(name) for name in (columns.y, columns.x)]
+    if not is_on_earth(table.column(columns.y).name) or (np.abs(degrees) > [[90], [360]]).any():
+        pair = f"{columns.x} and {columns.y}"
+        raise InputError(f"{table.path}: {pair} are no longitude and latitude in degrees; check --x and --y")
+    p, datum = on_tangent_plane(*degrees)
+    taken.append(f"{columns.x} and {columns.y} as x east and y north on the {datum}")
+    return p, datum
 
 
 def _with_field(table: Table, columns: Columns, taken: list[str]) -> Columns:
@@ -254,7 +272,7 @@ def _check_places(
         )
     elif 0 < span < LEAST_SPAN_M and np.abs(p[known]).max() > 1:
         taken.append(
-            f"x and y in metres, over {1e3 * span:.3g} mm only: if these are degrees, convert them to metres"
+            f"x and y in metres, over {1e3 * span:.3g} mm only: if these are degrees, call them lon and lat"
         )
 
 
