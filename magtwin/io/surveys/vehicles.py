@@ -1,7 +1,8 @@
-"""Vehicles: the field and the places in logs of PX4, ArduPilot and aircraft (pip install 'magtwin[vehicles]').
+"""Vehicles: the field and the places in logs of PX4, ArduPilot and aircraft.
 
-A log becomes columns at the times of its magnetometer: t [s]; x, y [m], east and north, or lon, lat [deg]; yaw
-[rad], counter-clockwise from east; bx, by, bz [nT], forward, left and up in axes that are level.
+A log becomes columns at the times of its magnetometer: t [s]; x, y [m], east and north, or lon, lat [deg];
+yaw [rad], counter-clockwise from east; bx, by, bz [nT], forward, left and up in axes that are level. The
+libraries come with `pip install 'magtwin[vehicles]'`.
 """
 
 from importlib import import_module
@@ -34,10 +35,8 @@ def columns_of_log(path: Path) -> Columns:
     Raises:
         InputError: The log is damaged or has no field, or the library that reads it is missing.
     """
-    suffix = path.suffix.lower()
-    read, library = {".ulg": (_px4, "pyulog"), ".bin": (_ardupilot, "pymavlink")}.get(
-        suffix, (_flight, "h5py")
-    )
+    readers = {".ulg": (_px4, "pyulog"), ".bin": (_ardupilot, "pymavlink")}
+    read, library = readers.get(path.suffix.lower(), (_flight, "h5py"))
     try:
         import_module(library)
     except ImportError:
@@ -56,21 +55,12 @@ def _px4(path: Path) -> Columns:
     """ULog: the magnetometer, the local position and the attitude that PX4 estimated."""
     from pyulog import ULog
 
-    names = [
-        "vehicle_magnetometer",
-        "sensor_combined",
-        "sensor_mag",
-        "vehicle_local_position",
-        "vehicle_attitude",
-    ]
+    three = [f"magnetometer_ga[{k}]" for k in range(3)]
+    sensors = {"vehicle_magnetometer": three, "sensor_combined": three, "sensor_mag": ["x", "y", "z"]}
     topics: dict[str, Any] = {}
-    for data in ULog(str(path), names).data_list:
+    for data in ULog(str(path), [*sensors, "vehicle_local_position", "vehicle_attitude"]).data_list:
         topics.setdefault(data.name, data.data)
-    for name, labels in (
-        ("vehicle_magnetometer", [f"magnetometer_ga[{k}]" for k in range(3)]),
-        ("sensor_combined", [f"magnetometer_ga[{k}]" for k in range(3)]),
-        ("sensor_mag", ["x", "y", "z"]),
-    ):
+    for name, labels in sensors.items():
         if labels[0] in topics.get(name, ()):
             t = topics[name]["timestamp"] / 1e6
             gauss = np.column_stack([topics[name][label] for label in labels])
