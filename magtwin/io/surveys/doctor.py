@@ -1,11 +1,16 @@
 """Doctor: what a recorded field is like, and what it is fit for."""
 
+import shlex
 from collections.abc import Collection
+from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.errors import InputError
+from magtwin.field.survey.readings import taken_of
 from magtwin.field.units import INDOORS_NT
 from magtwin.report.report import Figure, Report
 
@@ -28,6 +33,9 @@ STEPS = 0.02
 
 STUCK = 4.0
 """Factor above the longest repeat by chance from which a value counts as stuck."""
+
+LEAP = 2.0
+"""Factor above large usual changes of the change by which a coarse sensor leaves a value it was stuck at."""
 
 COARSE = 1.35
 """Mean number of equal values in a row from which the sensor is coarse, or slower than the logger."""
@@ -100,6 +108,43 @@ def examine(
     return Report("field", tuple(figures), metadata | ({"doubts": doubts} if doubts else {}))
 
 
+def info_of_survey(file: Path) -> Report:
+    """What the field in a table or a log is like, what it is fit for, and the command to type next.
+
+    Raises:
+        InputError: There is no field in it, or it is damaged.
+    """
+    from magtwin.io.surveys.logs import table_of_log
+    from magtwin.io.surveys.readings import read_readings
+    from magtwin.io.surveys.tabled import field_of_table
+
+    table = table_of_log(file)
+    vector, b, t, unit = field_of_table(table)
+    roles = [role for role, symbols in (("odometry", ("v", "w")),) if table.find(*symbols)]
+    try:
+        readings = read_readings(file)
+    except InputError as error:
+        report = examine(b, vector_nt=vector, t=t, roles=roles, unit=unit)
+        more: dict[str, object] = {"no survey yet": str(error).removeprefix(f"{table.path}: ")}
+        then = f"{shlex.quote(str(file))} --waypoints MARKS.csv" if "--waypoints" in str(error) else ""
+    else:
+        yaw = None if readings.by_hand else readings.yaw
+        report = examine(
+            readings.b_nt,
+            vector_nt=vector if vector is not None and len(vector) == len(readings) else None,
+            t=readings.t,
+            p_xy=readings.p_xy,
+            yaw=yaw,
+            roles=roles,
+            unit=unit,
+        )
+        more = {"taken": taken_of(readings)} if taken_of(readings) else {}
+        then = shlex.quote(str(file))
+    more |= {"next": f"magtwin map import {then}"} if then else {}
+    facts = (Figure("columns", ", ".join(table.names)),)
+    return replace(report, title=str(file), figures=facts + report.figures, metadata=report.metadata | more)
+
+
 def _fit(use: str, has: set[str], b: Array, p: Array | None) -> str:
     """Yes, or no and why."""
     if missing := [role for role in USES[use] if role not in has]:
@@ -141,7 +186,7 @@ def _stuck(b: Array, t: Array | None) -> Figure:
     held = lengths > STUCK * longest
     if usual.mean() > COARSE:  # a sound sensor leaves a value by a step, however long it stayed there
         jump = np.abs(np.append(np.diff(b[bounds[:-1]]), np.inf))
-        held &= jump > STUCK * np.median(jump)
+        held &= jump > LEAP * np.quantile(jump, 0.9)
     note = ""
     if held.any():
         k = int(np.argmax(lengths))

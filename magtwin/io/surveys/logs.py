@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.files.budget import BUDGETS, allowed, check_size
+from magtwin.files.kinds import ARCHIVE, TABLE, kind_of
 from magtwin.io.surveys.walk import Marks, marks_of, walked
 from magtwin.tables.labels import words_of
-from magtwin.tables.table import SPREADSHEETS, Column, Table, read_table, since_1970
+from magtwin.tables.table import PARQUET, SPREADSHEETS, Column, Table, read_table, since_1970
 
 Array = NDArray[np.float64]
 Parts = Mapping[str, Table]
@@ -48,6 +49,13 @@ def is_log(path: Path) -> bool:
         return True
     with path.open("rb") as file:
         return bool(_TRACE.search(file.read(1 << 16)))
+
+
+def is_survey(path: Path) -> bool:
+    """Whether a file is a table or log of another program, and no run, stage or network."""
+    if path.suffix.lower() in (*TABLES, *PARQUET, ".xyz", ".dat", ".tsv"):
+        return kind_of(path) in (None, TABLE) or is_log(path)
+    return kind_of(path) in (None, ARCHIVE) and is_log(path)
 
 
 def table_of_log(path: Path, waypoints: Path | None = None) -> Table:

@@ -84,16 +84,27 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
     )
 
 
+def field_of_table(table: Table) -> tuple[Array | None, Array, Array | None, str]:
+    """Vectors, magnitudes [nT] and times [s] of a table that may lack positions, and the unit of the field.
+
+    Raises:
+        InputError: There is no field in it, or a cell is not a number.
+    """
+    columns, taken = _complete(table, Columns(heading=NO_HEADING), placed=False)
+    vector, b = _field(table, columns)
+    return vector, b, _times(table, columns, columns, taken), columns.unit or "nT"
+
+
 def left_out(known: NDArray[np.bool_]) -> str:
     """A note on rows without a value."""
     missing = int(np.count_nonzero(~known))
     return f" ({missing} of {len(known)} rows without a value left out)" if missing else ""
 
 
-def _complete(table: Table, told: Columns) -> tuple[Columns, list[str]]:
+def _complete(table: Table, told: Columns, *, placed: bool = True) -> tuple[Columns, list[str]]:
     """Columns and unit, with missing ones found by name and size; and what was found so."""
     taken = list(table.notes)
-    columns = _placed(table, told, taken)
+    columns = _placed(table, told, taken) if placed else told
     if not (columns.heading or columns.quaternion):
         columns = replace(columns, heading="".join(table.find("heading")))
     if columns.quaternion:
@@ -103,7 +114,8 @@ def _complete(table: Table, told: Columns) -> tuple[Columns, list[str]]:
         taken.append("no heading, so the sensor as carried by hand, alike at all headings (--heading)")
     if not columns.field and not columns.vector:
         columns = _with_field(table, columns, taken)
-    _check_roles(table, columns)
+    if placed:
+        _check_roles(table, columns)
     if columns.heading_unit is None and columns.heading not in ("", NO_HEADING):
         angle = table.unit(columns.heading, "heading")
         meaning = meaning_of(table.column(columns.heading).name, "heading")

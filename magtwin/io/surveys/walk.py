@@ -94,8 +94,8 @@ def walked(table: Table, marks: Marks, moving: tuple[Array, Array] | None = None
     if at[-1] < begin or at[0] > end:
         if not -1 <= at[0] < at[-1] <= 1.05 * (end - begin) + 1:
             raise InputError(
-                f"{table.path}: {begin:.10g} to {end:.10g} s, and {marks.name}: {at[0]:.10g} to {at[-1]:.10g} s, "
-                "have no time in common; count both from the start of the log"
+                f"{table.path}: {begin:.10g} to {end:.10g} s, and {marks.name}: {at[0]:.10g} to "
+                f"{at[-1]:.10g} s, have no time in common; count both from the start of the log"
             )
         at = at + begin
         notes.append(f"the times of {marks.name} from the start of {table.path.name}")
