@@ -177,7 +177,7 @@ def raster(
     return AnomalyMap(
         values_nt=values,
         valid=valid,
-        variance_nt2=variance + offset**2,
+        variance_nt2=variance + offset**2 + readings.rounding_nt**2,
         between_nt2=interpolation_error_nt2(values, valid, headings, variance if read else None),
         origin_m=grid.origin_m,
         cell_m=grid.cell_m,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
+from magtwin.field.survey.hold import LEAST_MEAN, held
 from magtwin.field.survey.readings import taken_of
 from magtwin.field.units import INDOORS_NT
 from magtwin.report.report import Figure, Report
@@ -30,15 +31,6 @@ LEAST_SECTORS = 6
 
 STEPS = 0.02
 """Largest distance from a whole number of steps, in steps, of a value that a sensor rounded."""
-
-STUCK = 4.0
-"""Factor above the longest repeat by chance from which a value counts as stuck."""
-
-LEAP = 2.0
-"""Factor above large usual changes of the change by which a coarse sensor leaves a value it was stuck at."""
-
-COARSE = 1.35
-"""Mean number of equal values in a row from which the sensor is coarse, or slower than the logger."""
 
 USES = {
     "map": ("pose",),
@@ -177,24 +169,16 @@ def _rounding(values: Array) -> Figure:
 
 def _stuck(b: Array, t: Array | None) -> Figure:
     """Readings in stretches of one value that are far longer than chance or a fast logger makes."""
-    edges = np.flatnonzero(np.diff(b) != 0) + 1
-    bounds = np.concatenate([[0], edges, [len(b)]])
-    lengths = np.diff(bounds)
-    usual = lengths[lengths <= 4 * np.median(lengths)]
-    again = min(0.99, 1 - 1 / float(usual.mean()))
-    longest = max(4 * float(np.median(lengths)), np.log(len(b)) / -np.log(max(again, 0.1)))
-    held = lengths > STUCK * longest
-    if usual.mean() > COARSE:  # a sound sensor leaves a value by a step, however long it stayed there
-        jump = np.abs(np.append(np.diff(b[bounds[:-1]]), np.inf))
-        held &= jump > LEAP * np.quantile(jump, 0.9)
+    stuck, starts, usual = held(b)
+    lengths = np.diff(np.append(starts, len(b)))
     note = ""
-    if held.any():
-        k = int(np.argmax(lengths))
-        seconds = f", {t[bounds[k + 1] - 1] - t[bounds[k]]:.1f} s" if t is not None else ""
-        note = f"in {np.count_nonzero(held)} stretches; the longest {lengths[k]:,} readings{seconds}"
-    elif usual.mean() > COARSE:
-        note = f"each value comes {usual.mean():.2g} times: a coarse sensor, or a logger faster than it"
-    return Figure("stuck readings", int(lengths[held].sum()), note=note)
+    if stuck.any():
+        k = int(np.argmax(np.where(stuck, lengths, 0)))
+        seconds = f", {t[starts[k] + lengths[k] - 1] - t[starts[k]]:.1f} s" if t is not None else ""
+        note = f"in {np.count_nonzero(stuck)} stretches; the longest {lengths[k]:,} readings{seconds}"
+    elif usual > LEAST_MEAN:
+        note = f"each value comes {usual:.2g} times: a coarse sensor, or a logger faster than it"
+    return Figure("stuck readings", int(lengths[stuck].sum()), note=note)
 
 
 def _turns(vector: Array | None, yaw: Array | None) -> tuple[list[Figure], int]:

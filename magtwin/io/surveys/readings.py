@@ -227,6 +227,7 @@ def _together(parts: Sequence[Readings]) -> Readings:
     for key, default in unknown.items():
         values_of = {getattr(part, key) for part in parts}
         same[key] = values_of.pop() if len(values_of) == 1 else default
+    same["rounding_nt"] = max(part.rounding_nt for part in parts)
     same["by_hand"] = all(part.by_hand for part in parts)
     same["licence"] = "; ".join(dict.fromkeys(part.licence for part in parts if part.licence))
     runs = tuple(run for part in parts for run in part.runs)

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.field.grid import FARTHEST_M
 from magtwin.field.survey.folder import LARGEST_TURN, USUAL_SPAN_M
+from magtwin.field.survey.hold import held
 from magtwin.field.survey.readings import TAKEN, Readings
+from magtwin.field.survey.steps import LEFT, smooth_within_steps
 from magtwin.field.units import NT_PER, check_unit, nt_per, unit_by_size
 from magtwin.frames import yaw_from_quat
 from magtwin.io.surveys.axes import levelled, other_axes
@@ -48,6 +50,7 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
     p, datum = _positions(table, columns, taken)
     turn = _turn(table, columns)
     vector, b = _field(table, columns)
+    rounding = 0.0
     if turn is None and columns.heading == NO_HEADING and vector is not None and columns.axes != "world":
         what = (
             f"{columns.field} without {columns.vector}"
@@ -55,6 +58,8 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
             else f"the magnitude of {columns.vector}"
         )
         taken.append(f"{what}, since a sensor carried by hand has no heading")
+        if not columns.field:
+            b, rounding = _within_steps(vector, b, taken)
         vector = None
     t = _times(table, columns, told, taken)
     some = [p, b[:, None]] + [v.reshape(len(p), -1) for v in (turn, vector, t) if v is not None]
@@ -75,6 +80,7 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
         b_nt=b[known],
         b_body_nt=vector,
         t=None if t is None else t[known],
+        rounding_nt=rounding,
         by_hand=columns.heading == NO_HEADING,
         frame="world: x east, y north" if datum else "",
         datum=datum,
@@ -82,6 +88,18 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
         name=name,
         source=source + left_out(known) + "".join(notes),
     )
+
+
+def _within_steps(vector: Array, b: Array, taken: list[str]) -> tuple[Array, float]:
+    """Magnitudes of vectors of a coarse sensor, smooth within its steps, and the error that is left [nT]."""
+    if not np.isfinite(vector).all() or held(b)[0].any():
+        return b, 0.0  # a stuck sensor must still show
+    parts = [smooth_within_steps(part) for part in vector.T]
+    step = max(step for _, step in parts)
+    if step:
+        taken.append(f"components smooth within the sensor's step of {step:.3g} nT")
+        b = np.linalg.norm([values for values, _ in parts], axis=0)
+    return b, LEFT * step
 
 
 def field_of_table(table: Table) -> tuple[Array | None, Array, Array | None, str]:
