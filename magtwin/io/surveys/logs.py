@@ -183,8 +183,8 @@ def _marks(parts: Parts, field: str) -> Marks | None:
             return marks
     table = parts[field]
     if (labels := table.find("x", "y")) and table.find("t") and not {"x", "y", "z"} <= set(table.names):
-        known = np.isfinite([table.numbers(label) for label in labels]).all(axis=0)
-        if 2 <= np.count_nonzero(known) < BETWEEN * len(known):
+        known = np.isfinite(np.column_stack([table.numbers(label) for label in labels])).all(axis=1)
+        if 2 <= np.count_nonzero(known) < BETWEEN * table.rows:
             return marks_of(table)
     return None
 
