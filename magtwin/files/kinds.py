@@ -80,7 +80,7 @@ ACCEPTED: dict[str, tuple[Kind, ...]] = {
     "scene": (STAGE,),
     "USD file": (STAGE,),
     "map": (STAGE, SURVEY),
-    "source of readings": (RUN, SWEEP, READINGS, SURVEY, TABLE, COMMANDS, PATH),
+    "source of readings": (RUN, SWEEP, READINGS, SURVEY, TABLE, COMMANDS, PATH, ARCHIVE),
     "robot description": (URDF,),
     "robot": (URDF, STAGE),
     "weights file": (WEIGHTS, CHECKPOINT),

@@ -12,6 +12,7 @@ from magtwin.field.survey.nodes import read_survey
 from magtwin.files.file import existing
 from magtwin.files.kinds import kind_of, shipped_or
 from magtwin.io.formats import FORMATS, read_run
+from magtwin.io.surveys.logs import is_survey
 from magtwin.report.report import Figure, Report
 
 STAGES = (".usd", ".usda", ".usdc", ".usdz")
@@ -22,15 +23,15 @@ def info_of(path: str | os.PathLike[str], **reading: Any) -> Report:
     """A report on the content and origin of a file.
 
     Args:
-        path: A run in any format of `magtwin.io.formats`, a stage or a map, a folder of survey CSVs, or a
-            network.
+        path: A run in any format of `magtwin.io.formats`, a stage or a map, a folder of survey CSVs, a table
+            or log with a field, or a network.
         reading: Options of `magtwin.io.formats.read_run`, for a run.
 
     Raises:
         InputError: The file is missing, of an unknown kind, or damaged.
     """
     file = existing(shipped_or(Path(path)), "file")
-    if file.is_dir():
+    if file.is_dir() and not is_survey(file):
         return (
             map_metadata(read_survey(file)[0])
             if any(file.glob("*_map.csv"))
@@ -45,6 +46,10 @@ def info_of(path: str | os.PathLike[str], **reading: Any) -> Report:
         return report_onnx(file) if file.suffix.lower() == ".onnx" else load_predictor(file).report(str(file))
     if file.suffix.lower() in STAGES:
         return _info_of_usd(file)
+    if is_survey(file):
+        from magtwin.io.surveys.doctor import info_of_survey
+
+        return info_of_survey(file)
     if file.suffix.lower() in FORMATS:
         return info_of_run(file, **reading)
     if kind := kind_of(file):

@@ -26,6 +26,9 @@ LONGEST_LINE = 65_536
 QUOTED = 60
 """Most characters of a file that an error message quotes."""
 
+HEAD = 4096
+"""Bytes from which the encoding is found."""
+
 LOOKED = 50
 """Lines from which the separator is found."""
 
@@ -106,10 +109,12 @@ class Delimited:
     """Number and text of the lines that begin with `#`."""
 
 
-def read_delimited(path: str | os.PathLike[str], noun: str, wanted: str) -> Delimited:
+def read_delimited(
+    path: str | os.PathLike[str], noun: str, wanted: str, content: bytes | None = None
+) -> Delimited:
     """Read a text file of rows whose words are separated by commas, semicolons, tabs or blanks.
 
-    The text is UTF-8, UTF-16 with its mark, or cp1252, which older spreadsheets write. The header is the
+    The text is UTF-8, UTF-16, or cp1252, which older spreadsheets write. The header is the
     first line if any of its words is not a number, else the last comment line above the rows with as many
     words as they have. These are skipped: other lines that begin with `#`, such as `# KEY: VALUE`; those that
     begin with `/` if the first line does; empty lines; a first line `sep=;`; lines of prose above the header
@@ -123,16 +128,19 @@ def read_delimited(path: str | os.PathLike[str], noun: str, wanted: str) -> Deli
         path: The file.
         noun: What it is, for error messages.
         wanted: What a row holds, for error messages ("one row of numbers per reading").
+        content: The bytes of the file, if it lies in an archive.
 
     Raises:
         InputError: The file is missing, not text, or empty, or its lines are too long or of different widths.
     """
-    path = existing(path, noun)
-    if path.is_dir():
-        raise InputError(f"{path}: cannot be read (a folder); expected a {noun}")
-    check_size(path, "readings")
-    notes = list[str]()
-    lines, ended = _lines(path, _decoded(path, noun, notes))
+    if content is None:
+        path = existing(path, noun)
+        if path.is_dir():
+            raise InputError(f"{path}: cannot be read (a folder); expected a {noun}")
+        check_size(path, "readings")
+        content = path.read_bytes()
+    path, notes = Path(path), list[str]()
+    lines, ended = _lines(path, _decoded(path, content, noun, notes))
     comments, above, lines, told = _without_comments(lines, notes)
     if not lines:
         raise InputError(f"{path}: empty; expected {wanted}")
@@ -310,15 +318,21 @@ def _is_comment(line: str, slashed: bool = False) -> bool:
     return begun.startswith("#") and not _ERROR.fullmatch(re.split(r"[,;\t]", line, maxsplit=1)[0])
 
 
-def _decoded(path: Path, noun: str, notes: list[str]) -> str:
-    """The text of a file."""
-    content = path.read_bytes()
-    encoding = "utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
+def _decoded(path: Path, content: bytes, noun: str, notes: list[str]) -> str:
+    """The text of a file, with a note on an encoding other than UTF-8."""
+    head = content[:HEAD]
+    encoding = "utf-8-sig"
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encoding = "utf-16"
+    elif 3 * head.count(0) > len(head):  # one byte of two in plain letters
+        encoding = "utf-16-le" if head[1::2].count(0) > head[::2].count(0) else "utf-16-be"
     try:
         text = content.decode(encoding)
     except UnicodeDecodeError:
-        text = content.decode("cp1252", "replace")
-        notes.append("text in cp1252")
+        encoding = "cp1252"
+        text = content.decode(encoding, "replace")
+    if encoding != "utf-8-sig":
+        notes.append(f"text in {encoding}")
     if _CONTROL.search(text):
         raise InputError(f"{path}: not a text file; a {noun} is CSV in UTF-8")
     return text.replace("\r\n", "\n").replace("\r", "\n")
@@ -351,7 +365,7 @@ def _mark(lines: Sequence[str]) -> tuple[str | None, int] | None:
     words = lines[-1].split()
     numbers = all(_COMMA.fullmatch(word) or math.isfinite(number_of(word)) for word in words)
     if len(words) > 1 and numbers and any(map(_COMMA.fullmatch, words)):
-        return None, 0
+        return (None, 0) if (above := _above(lines, "\t")) is None else ("\t", above)
     bare = [re.sub(r'"[^"]*"', "", line) for line in lines]
     found = {mark: above for mark in ";\t," if (above := _above(bare, mark)) is not None}
     if 0 in found.values():

@@ -1,9 +1,10 @@
 """Labels: the words and the unit in the header of a column, and the quantity that they name."""
 
 import re
+import unicodedata
 from typing import NamedTuple
 
-from magtwin.tables.quantities import IN_BRACKETS, PLACES, QUANTITIES, UNITS
+from magtwin.tables.quantities import IN_BRACKETS, QUANTITIES, UNITS
 
 _SIGNS = str.maketrans(
     {
@@ -51,9 +52,10 @@ def split_label(text: str) -> Label:
     """Words and unit of a label.
 
     `pose.position.x [cm]` has the words pose, position, x and the unit cm; `posX` has the words pos and x.
-    `field.` at the beginning, as rostopic writes it, is no word.
+    `field.` at the beginning, as rostopic writes it, is no word, and letters have no accents.
     """
-    text = text[:LONGEST].strip().translate(_SIGNS)
+    text = unicodedata.normalize("NFKD", text[:LONGEST].strip().translate(_SIGNS))
+    text = "".join(letter for letter in text if not unicodedata.combining(letter))
     name = bare(text)
     unit = "_".join(word for word in words_of(text[len(name) :]) if word not in _LEFT_OUT)
     words: list[str] = []
@@ -74,13 +76,13 @@ def meaning_of(text: str, symbol: str) -> Meaning | None:
             return None
         for end in range(len(words), begin, -1):
             name, behind = "_".join(words[begin:end]), words[end:]
-            if name not in quantity.names:
+            if name not in quantity.places:
                 continue
             last = "_".join(word for word in behind if word not in _LEFT_OUT)
             is_unit = not unit and last in quantity.units and last not in IN_BRACKETS
             if is_unit or quantity.around.issuperset(behind):
                 around = begin + (0 if is_unit else len(behind))
-                return Meaning(quantity.names.index(name), around, last if is_unit else unit)
+                return Meaning(quantity.places[name], around, last if is_unit else unit)
     return None
 
 
@@ -96,10 +98,9 @@ def unit_of(text: str, symbol: str) -> str:
 
 def is_on_earth(text: str) -> bool:
     """Whether a label is that of a latitude or longitude."""
-    words, unit = split_label(text)
-    last = words[-1] if words else ""
-    in_degrees = unit.startswith("deg") and bool(meaning_of(bare(text), "x") or meaning_of(bare(text), "y"))
-    return in_degrees or (last in PLACES and (last != "long" or len(words) == 1))
+    if split_label(text).unit.startswith("deg") and any(meaning_of(bare(text), axis) for axis in "xy"):
+        return True
+    return any(meaning_of(text, angle) for angle in ("lat", "lon"))
 
 
 def bare(label: str) -> str:

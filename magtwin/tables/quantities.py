@@ -1,14 +1,16 @@
 """Quantities: the names and units by which columns are known, whatever wrote the table.
 
-One table for surveys, paths and commands. To read another word, add it here.
+One table for surveys, paths and commands, in English, German, French, Spanish and Italian. To read another
+word, add it here, in lower case and without accents.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 LENGTHS = {
-    **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
+    **dict.fromkeys(("m", "metre", "meter", "metres", "meters", "metros", "metri"), 1.0),
     "cm": 0.01,
     "mm": 0.001,
     "km": 1e3,
@@ -17,7 +19,7 @@ LENGTHS = {
 }
 """Metres per unit of length."""
 
-DEGREES = ("deg", "degree", "degrees")
+DEGREES = ("deg", "degree", "degrees", "grad", "degres", "grados", "gradi", "dd")
 ANGLES = {**dict.fromkeys(("rad", "radian", "radians"), 1.0), **dict.fromkeys(DEGREES, math.pi / 180)}
 """Radians per unit of angle."""
 
@@ -32,10 +34,9 @@ TIMES = {
 """Seconds per unit of time."""
 
 FIELDS = {
-    "nt": 1.0,
-    "nanotesla": 1.0,
-    "ut": 1e3,
-    "microtesla": 1e3,
+    **dict.fromkeys(("nt", "nanotesla", "nanoteslas", "gamma", "gammas"), 1.0),
+    **dict.fromkeys(("ut", "microtesla", "microteslas"), 1e3),
+    "mt": 1e6,
     "t": 1e9,
     "tesla": 1e9,
     "mg": 1e2,
@@ -44,6 +45,9 @@ FIELDS = {
     "gauss": 1e5,
 }
 """nT per unit of the magnetic field."""
+
+CLOCKWISE = (3,)
+"""Places among the names of a heading of those that count clockwise from north."""
 
 SPEEDS = {
     **dict.fromkeys(("m_s", "mps", "m_s_1"), 1.0),
@@ -62,17 +66,14 @@ RATES = {
 IN_BRACKETS = frozenset({"t", "g", "min", "h"})
 """Units that are read in brackets only: `b_t` may be the total, and `t_min` the least."""
 
-PLACES = frozenset({"lat", "latitude", "lon", "lng", "long", "longitude"})
-"""Names of places on Earth, which are no positions in metres."""
-
 
 @dataclass(frozen=True)
 class Quantity:
     """What a column may hold."""
 
     names: tuple[str, ...]
-    """Its names, the usual one first, in lower case with low lines between words. Those of one place belong
-    together in quantities of one kind, as easting and northing."""
+    """Its names, the usual one first, in lower case with low lines between words, and `|` between equals.
+    Those of one place belong together in quantities of one kind, as easting and northing."""
 
     units: Mapping[str, float]
     """Factors to SI units or nT, by unit in lower case."""
@@ -80,24 +81,81 @@ class Quantity:
     around: frozenset[str] = frozenset()
     """Words before or behind a name that say where it comes from."""
 
+    @cached_property
+    def places(self) -> dict[str, int]:
+        """Places in `names` by single name."""
+        return {one: k for k, names in reversed(list(enumerate(self.names))) for one in names.split("|")}
+
 
 _AT = frozenset(
-    ("p", "t", "pos", "position", "pose", "point", "coord", "wp", "map", "world", "base", "robot")
+    (
+        *(
+            "p",
+            "t",
+            "pos",
+            "position",
+            "pose",
+            "point",
+            "coord",
+            "wp",
+            "map",
+            "world",
+            "base",
+            "robot",
+            "rs",
+            "r",
+        ),
+        *("utm", "local", "coordinate", "koordinate", "coordonnee", "coordenada", "coordinata", "proj"),
+    )
 )
+_ON_EARTH = frozenset(("gps", "gnss", "geo", "wgs84", "pos", "position", "decimal", "dd"))
 _SENT = frozenset(("twist", "cmd", "vel", "msg", "data", "header"))
 _VECTORS = (
     *("b{}", "b_{}", "m{}", "mag_{}", "mag{}", "field_{}", "magnetic_field_{}", "mag_field_{}"),
-    "magnetometer_{}",
+    *("magnetometer_{}", "magnetfeld_{}", "feld_{}", "champ_{}", "campo_{}", "champ_magnetique_{}"),
+    *("campo_magnetico_{}", "flux_{}", "raw_mag_{}", "mag_raw_{}"),
 )
 
 QUANTITIES: dict[str, Quantity] = {
-    "x": Quantity(("x", "easting", "east", "rechtswert", "e", "px", "posx", "xpos", "tx"), LENGTHS, _AT),
-    "y": Quantity(("y", "northing", "north", "hochwert", "n", "py", "posy", "ypos", "ty"), LENGTHS, _AT),
-    "heading": Quantity(("heading", "yaw", "theta"), ANGLES, _AT),
+    "x": Quantity(
+        (
+            *("x", "easting|eastings", "east", "rechtswert", "e", "px", "posx", "xpos", "tx", "ostwert"),
+            *("est|ost", "este", "abscisse", "ascissa"),
+        ),
+        LENGTHS,
+        _AT,
+    ),
+    "y": Quantity(
+        (
+            *("y", "northing|northings", "north", "hochwert", "n", "py", "posy", "ypos", "ty", "nordwert"),
+            *("nord", "norte", "ordonnee", "ordinata"),
+        ),
+        LENGTHS,
+        _AT,
+    ),
+    "lon": Quantity(
+        ("lon|lng|long|longitude|lange|laenge|langengrad|longitud|longitudine",), ANGLES, _ON_EARTH
+    ),
+    "lat": Quantity(("lat|latitude|breite|breitengrad|latitud|latitudine",), ANGLES, _ON_EARTH),
+    "heading": Quantity(
+        ("heading", "yaw", "theta", "azimuth|azimut|bearing|compass|rumbo|kurs"), ANGLES, _AT
+    ),
     "t": Quantity(
         (
             *("t", "time", "timestamp", "stamp", "seconds_elapsed", "elapsed", "time_since_start", "times"),
-            *("seconds", "elapsed_time"),
+            *("seconds", "elapsed_time", "zeit", "uhrzeit", "zeitstempel", "temps", "heure", "horodatage"),
+            *(
+                "tiempo",
+                "hora",
+                "tempo",
+                "ora",
+                "datetime",
+                "date_time",
+                "utc",
+                "utc_time",
+                "gps_time",
+                "epoch",
+            ),
         ),
         TIMES,
         _SENT,
@@ -106,8 +164,22 @@ QUANTITIES: dict[str, Quantity] = {
         (
             *("field", "b_nt", "scalar_mag", "magnitude", "b_measured", "b_total", "b_ut", "absolute_field"),
             *("b", "b_tot", "btotal", "bt", "b_t", "b_mag", "b_abs", "bmag", "mag", "total", "total_field"),
-            *("mag_total", "magnetic_field", "mag_field", "tmi", "mag_tmi", "f", "feldstärke", "feldstaerke"),
-            *("gesamtfeld", "totalfeld"),
+            *("mag_total", "magnetic_field", "mag_field", "tmi", "mag_tmi", "f", "feldstarke", "feldstaerke"),
+            *("gesamtfeld", "totalfeld", "magnetfeld", "totalintensitat", "flussdichte", "intensitat"),
+            *("champ", "champ_total", "champ_magnetique", "champ_magnetique_total", "intensite", "module"),
+            *("campo", "campo_total", "campo_magnetico", "campo_magnetico_total", "intensidad", "modulo"),
+            *(
+                "campo_totale",
+                "intensita",
+                "intensita_totale",
+                "intensidad_total",
+                "intensite_totale",
+                "nt",
+                "ut",
+            ),
+            *("total_intensity", "total_magnetic_intensity", "magnetic_intensity", "flux_density", "mag1"),
+            *("magnetic_flux_density", "total_magnetic_field", "raw_mag", "mag_raw", "mag_1", "mag_1_uc"),
+            *("absolute_magnetic_field", "intensity", "strength", "field_strength", "scalar"),
         ),
         FIELDS,
     ),

@@ -25,7 +25,8 @@ from magtwin.tables.quantities import QUANTITIES
 Array = NDArray[np.float64]
 
 PARQUET = (".parquet", ".pq")
-"""Suffixes of Parquet; other tables are text."""
+SPREADSHEETS = (".xlsx", ".xls", ".ods")
+"""Suffixes of Parquet and of spreadsheets; other tables are text."""
 
 _EPOCHS = ((1e17, 1e9, "ns"), (1e14, 1e6, "us"), (1e11, 1e3, "ms"))
 """Least median of times since 1970, ticks per second and unit; below them are seconds."""
@@ -300,13 +301,15 @@ def read_table(
     path: str | os.PathLike[str],
     noun: str = "file of readings",
     wanted: str = "one row of numbers per reading",
+    content: bytes | None = None,
 ) -> Table:
-    """Read a table: Parquet by its suffix, else text, as `magtwin.tables.delimited` does.
+    """Read a table: Parquet and spreadsheets by their suffix, else text, as `magtwin.tables.delimited` does.
 
     Args:
         path: The file.
         noun: What it is, for error messages.
         wanted: What a row holds, for error messages.
+        content: The bytes of a text that lies in an archive.
 
     Raises:
         InputError: The file is missing, is neither, is damaged, or has no rows.
@@ -316,7 +319,11 @@ def read_table(
 
         path = existing(path, noun)
         return Table(tuple(Column(name, cells, path, None) for name, cells in parquet_columns(path)))
-    text = read_delimited(path, noun, wanted)
+    if content is None and Path(path).suffix.lower() in SPREADSHEETS:
+        from magtwin.tables.spreadsheet import text_of_spreadsheet
+
+        content = text_of_spreadsheet(existing(path, noun))
+    text = read_delimited(path, noun, wanted, content)
     names = text.names or ("",) * len(text.rows[0])
     pairs = zip(names, zip(*text.rows, strict=True), strict=True)
     columns = tuple(Column(name, list(cells), text.path, text.lines) for name, cells in pairs)

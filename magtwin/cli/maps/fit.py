@@ -13,7 +13,7 @@ from cyclopts import Parameter
 
 from magtwin.cli.maps.map import LAYERS, Earth, Kernel, Sources, earth_nt, map_app
 from magtwin.cli.options import Flag, Force, Jobs, Lab, Licence, Seed, Whole, headings_rad
-from magtwin.cli.terminal import Done, check_output, progress, step
+from magtwin.cli.terminal import Done, check_output, progress
 from magtwin.errors import InputError
 from magtwin.io.surveys.columns import About, Columns
 from magtwin.report.report import Report
@@ -27,6 +27,10 @@ class Reading:
     """How the files of a survey are read."""
 
     keep_stuck: KeepStuck = False
+
+    waypoints: Path | None = None
+    """Table of t,x,y, or of t and notes such as "1.5,2": when the sensor was carried past which places [m].
+    For the log of a phone, which has no positions."""
 
     pose_topic: str | None = None
     """Topic of the poses in a bag, if it has several."""
@@ -67,30 +71,33 @@ def _as_imported(sources: Sequence[Path]) -> Iterator[None]:
 @map_app.command(name="import")
 def map_import(
     *sources: Sources,
-    out: Path,
+    out: Path | None = None,
     about: AboutSurvey = ABOUT,
     reading: ReadingOptions = READING,
     force: Force = False,
 ) -> Done:
-    """Import a survey as a map layer, if it is gridded, or as a file of readings.
+    """Import a survey as a map layer, or as a file of readings.
 
+    A grid with a reading at each node keeps its values. To other readings a map is fitted, as by map fit.
     Stuck readings are found and masked. Outliers are reported and kept.
 
     Parameters
     ----------
     sources
-        Folder of 0_map.csv, 90_map.csv, ...: rows of x [m], y [m], heading [rad], field. Or tables (CSV,
-        Parquet), runs or rosbag2 folders; each is one run. A pattern in quotes ('drives/*.parquet') or a
-        folder of Parquet files stands for all its files. A plus joins files whose rows belong together:
-        time.csv+place.csv+field.csv.
+        Tables of x, y and the field, and perhaps the heading (CSV, Excel, Parquet); logs of phones (phyphox,
+        Sensor Logger, Android traces: file, folder or zip) and of vehicles (.ulg, .bin, .h5); runs or rosbag2
+        folders; each is one run. Or a folder of 0_map.csv, 90_map.csv, ..., one per heading. A pattern in
+        quotes ('drives/*.parquet') or a folder of Parquet files stands for all its files. A plus joins files
+        whose rows belong together: time.csv+place.csv+field.csv.
     out
-        Map layer (.usdc) or readings (.parquet) to write.
+        Map layer (.usdc) or readings (.parquet) to write. Default: the name of the first source, with .usdc.
     """
     from magtwin.io.surveys.maps import import_survey
 
+    out = out or Path(f"{Path(sources[0]).stem}.usdc")
     check_output(out, (*LAYERS, ".parquet"), "a map layer, or a file of readings,", force=force)
-    step("Reading the survey")
-    report = import_survey(sources, out, about=about, force=force, **vars(reading))
+    with progress("Reading the survey") as advance:
+        report = import_survey(sources, out, about=about, progress=advance, force=force, **vars(reading))
     return _done(report, out)
 
 

@@ -177,7 +177,7 @@ def raster(
     return AnomalyMap(
         values_nt=values,
         valid=valid,
-        variance_nt2=variance + offset**2,
+        variance_nt2=variance + offset**2 + readings.rounding_nt**2,
         between_nt2=interpolation_error_nt2(values, valid, headings, variance if read else None),
         origin_m=grid.origin_m,
         cell_m=grid.cell_m,
@@ -193,9 +193,10 @@ def offset_sd_nt(readings: Readings) -> float:
     """Standard deviation of an error that is alike all over a map of the readings [nT].
 
     A robot that drives adds the fields of its motors, battery and LiDAR. What is alike throughout its only
-    drive cannot be told from the field of the room, and no reading of the drive disagrees with it.
+    drive cannot be told from the field of the room, and no reading of the drive disagrees with it. A
+    sensor carried by hand has no such error.
     """
-    drive = readings.grid is None and readings.t is not None
+    drive = readings.grid is None and readings.t is not None and not readings.by_hand
     return OFFSET_SD_NT if drive and np.ptp(readings.run[readings.good]) == 0 else 0.0
 
 

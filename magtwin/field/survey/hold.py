@@ -23,6 +23,28 @@ LONG = 4.0  # Lengths above this many medians are those of a robot that waited o
 DIGITS = 6  # Decimals of a magnitude [nT] that are compared; further ones are floating-point errors
 
 
+STUCK = 4.0  # Factor above the longest repeat by chance from which a value counts as stuck
+LEAP = 2.0  # Factor above large usual changes of the change by which a coarse sensor leaves such a value
+
+
+def held(b_nt: NDArray[np.float64]) -> tuple[NDArray[np.bool_], Rows, float]:
+    """Which groups of equal values are too long for chance and for a fast logger.
+
+    A sound coarse sensor leaves a value by a step, however long it stayed there. With b (N,), returns flags
+    and the first rows of the groups, and the usual length.
+    """
+    starts = np.flatnonzero(np.append(True, np.diff(b_nt) != 0))
+    lengths = np.diff(np.append(starts, len(b_nt)))
+    usual = float(lengths[lengths <= LONG * np.median(lengths)].mean())
+    again = min(0.99, max(0.1, 1 - 1 / usual))
+    longest = max(LONG * float(np.median(lengths)), np.log(len(b_nt)) / -np.log(again))
+    stuck = lengths > STUCK * longest
+    if usual > LEAST_MEAN:
+        jump = np.abs(np.append(np.diff(b_nt[starts]), 0.0))
+        stuck &= jump > LEAP * np.quantile(jump, 0.9)
+    return stuck, starts, usual
+
+
 def without_repeats(readings: Readings) -> Readings:
     """Drop the repeats in runs whose logger was faster than the magnetometer.
 

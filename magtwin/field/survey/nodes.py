@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from magtwin.errors import InputError
+from magtwin.field.grid import Grid
 from magtwin.field.maps.curvature import interpolation_error_nt2
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import statistics
@@ -36,6 +37,37 @@ from magtwin.report.report import Figure, Report
 METHOD = "survey, one reading a node and heading, the robot at rest"
 
 
+OFF_NODE = 0.02  # Largest distance of a place from its node, in spacings
+FULL = 0.25  # Least share of the nodes of a lattice that have a reading
+
+
+def on_lattice(readings: Readings) -> Readings:
+    """The readings as a gridded survey if they are one: a reading at each of many nodes of one heading.
+
+    Other readings are returned as they are.
+    """
+    p, yaw = readings.p_xy, readings.yaw % (2 * np.pi)
+    if readings.grid is not None or np.ptp(yaw) > 0:
+        return readings
+    axes, node = [], [np.zeros(len(p), np.intp)]
+    for values in p.T[::-1]:
+        places = np.unique(values)
+        gaps = np.diff(places)
+        if not len(gaps):
+            return readings
+        step = float(np.median(gaps[gaps > gaps.max() / 1e3]))
+        at = np.round((values - places[0]) / step).astype(np.intp)
+        if np.abs(values - places[0] - at * step).max() > OFF_NODE * step:
+            return readings
+        axes.append((float(places[0]), step, int(at.max()) + 1))
+        node.append(at)
+    (y0, dy, rows), (x0, dx, columns) = axes
+    if len(np.unique(node[1] * columns + node[2])) < len(p) or len(p) < FULL * rows * columns:
+        return readings
+    grid = Grid(origin_m=(x0, y0), cell_m=(dx, dy), headings_rad=(float(yaw[0]),), rows=rows, columns=columns)
+    return readings.with_(grid=grid.in_memory(), node=np.column_stack(node))
+
+
 def node_map(readings: Readings) -> AnomalyMap:
     """The map whose values are the readings themselves, each at its node.
 
@@ -45,8 +77,7 @@ def node_map(readings: Readings) -> AnomalyMap:
     """
     if readings.grid is None or readings.node is None:
         raise InputError(
-            f"survey {readings.name!r} is not gridded, so that its nodes make no map; "
-            "fit a model to it (magtwin.field.fit.fit, `magtwin map fit`)"
+            f"survey {readings.name!r} is not gridded, so that its nodes make no map; fit one to it (fit_map)"
         )
     grid = readings.grid
     flat = np.ravel_multi_index(tuple(readings.node.T), grid.shape)

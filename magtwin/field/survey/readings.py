@@ -46,6 +46,8 @@ class Readings(Summarized):
     datum: str = ""  # Origin of that frame in the room or on Earth; "" if unknown
     # The Earth's field in that frame [nT]; None if unknown
     earth_nt: tuple[float, float, float] | None = None
+    rounding_nt: float = 0.0  # Standard deviation of rounding errors that are alike in neighbours [nT]
+    by_hand: bool = False  # Whether no robot carried the sensor, so that it reads alike at all headings
 
     def __post_init__(self) -> None:
         p = np.asarray(self.p_xy, float)

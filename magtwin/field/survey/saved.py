@@ -47,6 +47,8 @@ def save_readings(readings: Readings, path: str | os.PathLike[str], *, force: bo
             arrays.append(array)
     about: dict[str, Any] = {key: getattr(readings, key) for key in (*_TEXTS, *_PLACES)}
     about |= {"runs": readings.runs, "height_m": readings.height_m, "earth_nt": readings.earth_nt}
+    about |= {"by_hand": True} if readings.by_hand else {}
+    about |= {"rounding_nt": readings.rounding_nt} if readings.rounding_nt else {}
     about["grid"] = None if readings.grid is None else asdict(readings.grid)
     schema = pa.schema(fields, metadata={_SURVEY: json.dumps(about, ensure_ascii=False)})
     split = {f.name: "BYTE_STREAM_SPLIT" for f in fields if pa.types.is_floating(f.type)}
@@ -70,6 +72,7 @@ def load_readings(path: str | os.PathLike[str]) -> Readings:
         )
         given = {key: about[key] for key in (*_TEXTS, "height_m")} | {"runs": tuple(about["runs"])}
         given |= {key: about.get(key, "") for key in _PLACES} | {"earth_nt": about.get("earth_nt")}
+        given |= {"by_hand": about.get("by_hand") is True, "rounding_nt": about.get("rounding_nt", 0.0)}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         if isinstance(error, InputError):
             raise InputError(f"{path}: {error}") from error

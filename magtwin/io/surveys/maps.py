@@ -11,7 +11,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.changes import changes_line
 from magtwin.field.survey.folder import heading_doubts
-from magtwin.field.survey.nodes import node_map
+from magtwin.field.survey.nodes import node_map, on_lattice
 from magtwin.field.survey.nodes import read_survey as read_folder
 from magtwin.field.survey.readings import Readings, masked_words
 from magtwin.field.survey.saved import save_readings
@@ -40,13 +40,19 @@ MOST_MASKED = 0.9
 
 
 def import_survey(
-    sources: Sequence[Source], out: Source, *, about: About | None = None, force: bool = False, **reading: Any
+    sources: Sequence[Source],
+    out: Source,
+    *,
+    about: About | None = None,
+    progress: Progress | None = None,
+    force: bool = False,
+    **reading: Any,
 ) -> Report:
-    """Write a survey as a map layer, which it must be gridded for, or as readings.
+    """Write a survey as a map layer, or as readings.
 
     Sources are those of `read_readings`; a folder with one CSV per heading too. The output is a map layer
-    (.usdc) or readings (.parquet); `about` are metadata that the files lack, `reading` options of
-    `survey_and_report`.
+    (.usdc) or readings (.parquet). A grid with a reading at each node keeps its values; to other readings a
+    map is fitted. `about` are metadata that the files lack, `reading` options of `survey_and_report`.
     """
     out, columns, about = check_free(out, force=force), reading.get("columns") or Columns(), about or About()
     name = about.name or out.stem
@@ -57,10 +63,10 @@ def import_survey(
         save_map(field, out, force=force)
         return report
     readings, found = survey_and_report(sources, about=about, **reading)
-    readings, found = (
-        readings.with_(name=name),
-        _with_doubts(found, [*heading_doubts(readings), *vector_doubts(readings)]),
-    )
+    readings = readings.with_(name=name) if table else on_lattice(readings.with_(name=name))
+    if not table and readings.grid is None:
+        return _fitted(readings, out, found, progress=progress, force=force)
+    found = _with_doubts(found, [*heading_doubts(readings), *vector_doubts(readings)])
     if table:
         save_readings(readings, out, force=force)
         return _joined(readings.report(), found)
@@ -88,17 +94,43 @@ def fit_survey(
     the Earth's field in world axes for the harmonic fit. Spacing and headings are chosen by accuracy if they
     are not given. The report is on the map, its grid, stuck readings and doubts.
     """
-    from magtwin.field.fit.choice import choice_report
-    from magtwin.field.fit.fit import fit, grid_report, raster
-
     out = check_free(out, force=force)
     options = _method_options([method], kernel, earth_nt).get(method, {})
     readings, report = survey_and_report(sources, keep_stuck=keep_stuck)
-    doubts = [*_doubts(readings, sources[0]), *_shared(readings, method)]
+    return _fitted(
+        readings.with_(name=out.stem),
+        out,
+        report,
+        method,
+        spacing_m=spacing_m,
+        headings_rad=headings_rad,
+        progress=progress,
+        force=force,
+        **options,
+    )
+
+
+def _fitted(
+    readings: Readings,
+    out: Path,
+    report: Report,
+    method: str = "auto",
+    *,
+    spacing_m: float | None = None,
+    headings_rad: Sequence[float] | None = None,
+    progress: Progress | None = None,
+    force: bool = False,
+    **options: Any,
+) -> Report:
+    """Fit a map to readings, write it, and report on it and on the readings."""
+    from magtwin.field.fit.choice import choice_report
+    from magtwin.field.fit.fit import fit, grid_report, raster
+
+    doubts = [*_doubts(readings), *_shared(readings, method)]
     model = fit(readings, method, progress=progress, **options)
     field = raster(
         model,
-        readings.with_(name=out.stem),
+        readings,
         spacing_m=spacing_m,
         headings_rad=headings_rad,
         progress=progress,
@@ -139,15 +171,15 @@ def _is_grid(source: Path, columns: Columns) -> bool:
     return kind_of(source) is SURVEY and replace(columns, unit=None, scale=None) == Columns()
 
 
-def _doubts(readings: Readings, source: Source) -> list[str]:
+def _doubts(readings: Readings) -> list[str]:
     """What makes a map of these readings doubtful; too few readings are refused."""
     from magtwin.field.fit.harmonic.problem import ONE_HEADING
 
     count, yaw, doubts = int(readings.good.sum()), readings.yaw[readings.good], list[str]()
     if readings.grid is None and count < LEAST_READINGS:
         raise InputError(
-            f"{source}: {count} of {len(readings)} readings are good{masked_words(readings)}; a map needs "
-            f"{LEAST_READINGS} at least, and some hundred to be of use"
+            f"{readings.name}: {count} of {len(readings)} readings are good{masked_words(readings)}; a map "
+            f"needs {LEAST_READINGS} at least, and some hundred to be of use"
         )
     if readings.grid is None and count < USUAL_READINGS:
         doubts.append(f"only {count} good readings: the map is valid only next to them")
@@ -155,11 +187,11 @@ def _doubts(readings: Readings, source: Source) -> list[str]:
         doubts.append(line)
     doubts += [*heading_doubts(readings), *vector_doubts(readings)]
     mean = np.exp(1j * yaw).mean()
-    if np.abs(mean) >= ONE_HEADING:
+    if np.abs(mean) >= ONE_HEADING and not readings.by_hand:
         doubts.append(
-            f"one heading only, {np.degrees(np.angle(mean)):.0f} deg: unless the sensor was carried by hand, "
-            "the robot's own field cannot be separated from the room's, and a simulated robot adds its own "
-            "again; survey in several headings"
+            f"one heading only, {np.degrees(np.angle(mean)):.0f} deg: the robot's own field cannot "
+            "be separated from the room's, and a simulated robot adds its own again; survey in several "
+            "headings, or give --heading none if the sensor was carried by hand"
         )
     return doubts
 
@@ -206,7 +238,7 @@ def _shared(readings: Readings, method: str) -> list[str]:
             f"the room's field; the standard deviations hold {offset:g} nT for it (offset sd), which "
             "localization takes for an unknown bias; survey at rest, node by node, for a smaller one"
         )
-    elif readings.t is not None:
+    elif readings.t is not None and not readings.by_hand:
         doubts.append(
             "readings of drives: the standard deviations do not hold what the robot adds alike in all runs "
             "(motors, battery, LiDAR); survey at rest, node by node, for intervals that hold"

@@ -21,6 +21,7 @@ from magtwin.files.kinds import READINGS, RUN, SURVEY, expected, kind_of
 from magtwin.io.formats import read_run
 from magtwin.io.surveys.axes import levelled
 from magtwin.io.surveys.columns import Columns
+from magtwin.io.surveys.logs import is_log, table_of_log
 from magtwin.io.surveys.tabled import left_out, readings_of_table
 from magtwin.run.run import Run
 from magtwin.tables.table import PARQUET, read_table
@@ -40,12 +41,14 @@ def read_readings(
     headings_deg: tuple[float, ...] | None = None,
     pose_topic: str | None = None,
     field_topic: str | None = None,
+    waypoints: Source | None = None,
     **about: Any,
 ) -> Readings:
     """Read the readings of a survey from any supported source.
 
     A source is a folder of one CSV per heading (`magtwin.field.survey.folder`); a table of readings, CSV or
-    Parquet; several files with matching rows, joined by `+` (`1-time.csv+1-loc.csv+1-mag.csv`; the others are
+    Parquet or a spreadsheet; a log of a phone or vehicle (`magtwin.io.surveys.logs`); several files with
+    matching rows, joined by `+` (`1-time.csv+1-loc.csv+1-mag.csv`; the others are
     searched for beside the first); the Parquet of a Run or of Readings; or a rosbag2, as a folder or a
     storage file. Several sources are several runs of one survey, as are the files of a pattern
     (`drives/*.parquet`) and the Parquet files of a folder, in the order of their names.
@@ -56,6 +59,8 @@ def read_readings(
         headings_deg: Headings of a folder of CSVs [deg], if it is incomplete.
         pose_topic: Topic of a bag's poses, if there are several.
         field_topic: Topic of a bag's field, if there are several.
+        waypoints: Table of t,x,y, the times at which the sensor was carried past places, for a log without
+            positions (`magtwin.io.surveys.walk`).
         about: Metadata that replace those of the sources, unless None or "": `name`, `licence`, `created`,
             `height_m` [m], `frame` and `datum`, as in `magtwin.io.surveys.columns.About`.
 
@@ -77,7 +82,8 @@ def read_readings(
         if same is not source:
             twice.append(f"{source} and {same} as one, since their bytes are equal")
             continue
-        parts.append(_part(source, columns, headings_deg, {k: name for k, name in topics.items() if name}))
+        named = {k: name for k, name in topics.items() if name}
+        parts.append(_part(source, columns, headings_deg, named, waypoints))
     readings = parts[0] if len(parts) == 1 else _together(parts)
     if twice:
         readings = readings.with_(source="; ".join([readings.source, *(TAKEN + text for text in twice)]))
@@ -164,19 +170,26 @@ def _identity(source: Source) -> str:
 
 
 def _part(
-    source: Source, columns: Columns, headings_deg: tuple[float, ...] | None, topics: dict[str, str]
+    source: Source,
+    columns: Columns,
+    headings_deg: tuple[float, ...] | None,
+    topics: dict[str, str],
+    waypoints: Source | None,
 ) -> Readings:
     """The readings of one source, by the kind of its file."""
     path = _first(source)
     kind = kind_of(path)
-    if kind is None and path.is_dir():
+    if kind is None and path.is_dir() and not is_log(path):
         kind = SURVEY  # whose reader tells what is missing
     if path != Path(source) or kind not in (RUN, READINGS, SURVEY):
         paths = [path, *(_beside(path, word) for word in str(source).split("+")[1:] if path != Path(source))]
-        table = read_table(path)
+        marks = None if waypoints is None else existing(waypoints, "table of waypoints")
+        table = table_of_log(path, marks) if len(paths) == 1 else read_table(path)
         for other in paths[1:]:
             table = table.beside(read_table(other))
         return readings_of_table(table, columns, path.stem, "; ".join(map(_sum, paths)))
+    if waypoints is not None:
+        raise InputError(f"{path}: its positions are known; leave out --waypoints", parameter="waypoints")
     if replace(columns, unit=None, scale=None) != Columns():
         raise InputError(f"{path}: its columns are known; drop the options that name columns")
     if kind is SURVEY:
@@ -214,6 +227,8 @@ def _together(parts: Sequence[Readings]) -> Readings:
     for key, default in unknown.items():
         values_of = {getattr(part, key) for part in parts}
         same[key] = values_of.pop() if len(values_of) == 1 else default
+    same["rounding_nt"] = max(part.rounding_nt for part in parts)
+    same["by_hand"] = all(part.by_hand for part in parts)
     same["licence"] = "; ".join(dict.fromkeys(part.licence for part in parts if part.licence))
     runs = tuple(run for part in parts for run in part.runs)
     source = "; ".join(part.source for part in parts)

@@ -9,13 +9,16 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.field.grid import FARTHEST_M
 from magtwin.field.survey.folder import LARGEST_TURN, USUAL_SPAN_M
+from magtwin.field.survey.hold import held
 from magtwin.field.survey.readings import TAKEN, Readings
+from magtwin.field.survey.steps import LEFT, smooth_within_steps
 from magtwin.field.units import NT_PER, check_unit, nt_per, unit_by_size
 from magtwin.frames import yaw_from_quat
 from magtwin.io.surveys.axes import levelled, other_axes
 from magtwin.io.surveys.columns import NO_HEADING, Columns
-from magtwin.tables.labels import is_on_earth, split_label, unit_of
-from magtwin.tables.quantities import ANGLES, DEGREES, FIELDS
+from magtwin.io.surveys.places import on_tangent_plane
+from magtwin.tables.labels import is_on_earth, meaning_of, split_label, unit_of
+from magtwin.tables.quantities import ANGLES, CLOCKWISE, DEGREES, FIELDS
 from magtwin.tables.table import Table, since_1970
 
 Array = NDArray[np.float64]
@@ -44,9 +47,10 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
             line), no unit fits, or columns contradict each other.
     """
     columns, taken = _complete(table, told)
-    p = np.column_stack([table.numbers(columns.x, "x"), table.numbers(columns.y, "y")])
+    p, datum = _positions(table, columns, taken)
     turn = _turn(table, columns)
     vector, b = _field(table, columns)
+    rounding = 0.0
     if turn is None and columns.heading == NO_HEADING and vector is not None and columns.axes != "world":
         what = (
             f"{columns.field} without {columns.vector}"
@@ -54,6 +58,8 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
             else f"the magnitude of {columns.vector}"
         )
         taken.append(f"{what}, since a sensor carried by hand has no heading")
+        if not columns.field:
+            b, rounding = _within_steps(vector, b, taken)
         vector = None
     t = _times(table, columns, told, taken)
     some = [p, b[:, None]] + [v.reshape(len(p), -1) for v in (turn, vector, t) if v is not None]
@@ -62,7 +68,7 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
         text = f"no row is complete; all {len(known)} have a cell that is empty or nan"
         raise InputError(f"{table.path}: {text}")
     _check_places(table, columns, p, known, taken)
-    turn = _upright(table, columns, turn, vector, known)
+    turn = _upright(table, columns, turn, known)
     _check_field(table, columns, told, p, b, known, taken)
     if vector is not None:
         _check_vectors(table, columns, vector[known], b[known], turn[known])
@@ -74,10 +80,37 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
         b_nt=b[known],
         b_body_nt=vector,
         t=None if t is None else t[known],
+        rounding_nt=rounding,
+        by_hand=columns.heading == NO_HEADING,
+        frame="world: x east, y north" if datum else "",
+        datum=datum,
         runs=(name,),
         name=name,
         source=source + left_out(known) + "".join(notes),
     )
+
+
+def _within_steps(vector: Array, b: Array, taken: list[str]) -> tuple[Array, float]:
+    """Magnitudes of vectors of a coarse sensor, smooth within its steps, and the error that is left [nT]."""
+    if not np.isfinite(vector).all() or held(b)[0].any():
+        return b, 0.0  # a stuck sensor must still show
+    parts = [smooth_within_steps(part) for part in vector.T]
+    step = max(step for _, step in parts)
+    if step:
+        taken.append(f"components smooth within the sensor's step of {step:.3g} nT")
+        b = np.linalg.norm([values for values, _ in parts], axis=0)
+    return b, LEFT * step
+
+
+def field_of_table(table: Table) -> tuple[Array | None, Array, Array | None, str]:
+    """Vectors, magnitudes [nT] and times [s] of a table that may lack positions, and the unit of the field.
+
+    Raises:
+        InputError: There is no field in it, or a cell is not a number.
+    """
+    columns, taken = _complete(table, Columns(heading=NO_HEADING), placed=False)
+    vector, b = _field(table, columns)
+    return vector, b, _times(table, columns, columns, taken), columns.unit or "nT"
 
 
 def left_out(known: NDArray[np.bool_]) -> str:
@@ -86,20 +119,28 @@ def left_out(known: NDArray[np.bool_]) -> str:
     return f" ({missing} of {len(known)} rows without a value left out)" if missing else ""
 
 
-def _complete(table: Table, told: Columns) -> tuple[Columns, list[str]]:
+def _complete(table: Table, told: Columns, *, placed: bool = True) -> tuple[Columns, list[str]]:
     """Columns and unit, with missing ones found by name and size; and what was found so."""
     taken = list(table.notes)
-    columns = _placed(table, told, taken)
+    columns = _placed(table, told, taken) if placed else told
     if not (columns.heading or columns.quaternion):
         columns = replace(columns, heading="".join(table.find("heading")))
     if columns.quaternion:
         columns = _in_order(table, columns, taken)
+    if not columns.heading and not columns.quaternion and columns.axes != "world":
+        columns = replace(columns, heading=NO_HEADING)
+        taken.append("no heading, so the sensor as carried by hand, alike at all headings (--heading)")
     if not columns.field and not columns.vector:
         columns = _with_field(table, columns, taken)
-    _check_roles(table, columns)
+    if placed:
+        _check_roles(table, columns)
     if columns.heading_unit is None and columns.heading not in ("", NO_HEADING):
         angle = table.unit(columns.heading, "heading")
-        if angle in ANGLES:
+        meaning = meaning_of(table.column(columns.heading).name, "heading")
+        if meaning and meaning.name in CLOCKWISE:
+            columns = replace(columns, heading_unit="compass")
+            taken.append(f"{columns.heading} clockwise from north, by its name (--heading-unit)")
+        elif angle in ANGLES:
             columns = replace(columns, heading_unit="deg" if angle in DEGREES else "rad")
             taken.append(f"{columns.heading} in {columns.heading_unit}, by its name (--heading-unit)")
     if columns.unit is None and columns.scale is None:
@@ -119,27 +160,38 @@ def _complete(table: Table, told: Columns) -> tuple[Columns, list[str]]:
 
 
 def _placed(table: Table, told: Columns, taken: list[str]) -> Columns:
-    """Columns with those of x and y found by name; refuses latitude and longitude."""
+    """Columns with those of x and y found by name, else those of longitude and latitude."""
     used = {told.field, *told.several("vector")}
     labels = [told.x or "".join(table.find("x", apart=used)), told.y or "".join(table.find("y", apart=used))]
     if not (told.x or told.y):
         labels = table.find("x", "y", apart=used) or table.find("x", "y")
-    names = [table.column(label).name for label in labels if label]
-    on_earth = list(filter(is_on_earth, names if all(labels) and labels else table.names))
-    if len(on_earth) > 1:
-        shown = " and ".join(repr(label) for label in on_earth[:2])
-        text = f"{shown} are latitude and longitude; give x,y in metres in the axes of the lab"
-        raise InputError(f"{table.path}: {text}")
+        labels = table.find("lon", "lat") if not labels or any(map(is_on_earth, labels)) else labels
     if not labels or not all(labels):
         raise InputError(
-            f"{table.path}: no column of x and of y {_seen(table)}; name both: --x NAME --y NAME"
+            f"{table.path}: no column of x and of y {_seen(table)}; name both: --x NAME --y NAME; or write "
+            "down when you passed which places, as t,x,y, and give that file: --waypoints FILE"
         )
     columns = replace(told, x=labels[0], y=labels[1])
+    if is_on_earth(table.column(columns.x).name):
+        return columns
     notes = table.taken({"x": columns.x, "y": columns.y})
     taken += [note for note in notes if "by the units" in note]
     if not (told.x or told.y):
         taken += [f"{note} (--x, --y)" for note in notes if note.endswith(" as x and y")]
     return columns
+
+
+def _positions(table: Table, columns: Columns, taken: list[str]) -> tuple[Array, str]:
+    """Positions [m], shape (N, 2), and the origin of those that were longitudes and latitudes."""
+    if not is_on_earth(table.column(columns.x).name):
+        return np.column_stack([table.numbers(columns.x, "x"), table.numbers(columns.y, "y")]), ""
+    degrees = [table.numbers(name) for name in (columns.y, columns.x)]
+    if not is_on_earth(table.column(columns.y).name) or (np.abs(degrees) > [[90], [360]]).any():
+        pair = f"{columns.x} and {columns.y}"
+        raise InputError(f"{table.path}: {pair} are no longitude and latitude in degrees; check --x and --y")
+    p, datum = on_tangent_plane(*degrees)
+    taken.append(f"{columns.x} and {columns.y} as x east and y north on the {datum}")
+    return p, datum
 
 
 def _with_field(table: Table, columns: Columns, taken: list[str]) -> Columns:
@@ -250,23 +302,13 @@ def _check_places(
         )
     elif 0 < span < LEAST_SPAN_M and np.abs(p[known]).max() > 1:
         taken.append(
-            f"x and y in metres, over {1e3 * span:.3g} mm only: if these are degrees, convert them to metres"
+            f"x and y in metres, over {1e3 * span:.3g} mm only: if these are degrees, call them lon and lat"
         )
 
 
-def _upright(
-    table: Table, columns: Columns, turn: Array | None, vector: Array | None, known: NDArray[np.bool_]
-) -> Array:
+def _upright(table: Table, columns: Columns, turn: Array | None, known: NDArray[np.bool_]) -> Array:
     """Headings, or quaternions of length 1; zeros for a sensor that was carried by hand."""
     if turn is None:
-        if columns.heading != NO_HEADING if vector is None else columns.axes != "world":
-            none = "if the sensor was carried by hand, give --heading none"
-            if vector is not None:
-                none += "; vectors in world axes need none (--axes world)"
-            raise InputError(
-                f"{table.path}: no heading: no column is called heading, yaw, theta; {none}; else name it "
-                "with --heading or --quaternion"
-            )
         return np.zeros(len(known))
     if turn.ndim == 1:
         return turn

@@ -1,0 +1,150 @@
+"""Vehicles: the field and the places in logs of PX4, ArduPilot and aircraft.
+
+A log becomes columns at the times of its magnetometer: t [s]; x, y [m], east and north, or lon, lat [deg];
+yaw [rad], counter-clockwise from east; bx, by, bz [nT], forward, left and up in axes that are level. The
+libraries come with `pip install 'magtwin[vehicles]'`.
+"""
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+
+Array = NDArray[np.float64]
+Columns = dict[str, Array]
+
+FLIGHT = {
+    "t": ("tt", "t", "time"),
+    "x [m]": ("utm_x", "x", "easting"),
+    "y [m]": ("utm_y", "y", "northing"),
+    "lon": ("lon", "longitude"),
+    "lat": ("lat", "latitude"),
+    "field [nT]": ("mag_1_uc", "mag_1_c", "mag", "tmi", "mag_1"),
+}
+"""Names of the data sets of a flight, the best first. Those of SGL's flights for MagNav are the first ones,
+of which mag_1_uc is the magnetometer on the tail, not compensated."""
+
+
+def columns_of_log(path: Path) -> Columns:
+    """The columns of a log, by its suffix.
+
+    Raises:
+        InputError: The log is damaged or has no field, or the library that reads it is missing.
+    """
+    readers = {".ulg": (_px4, "pyulog"), ".bin": (_ardupilot, "pymavlink")}
+    read, library = readers.get(path.suffix.lower(), (_flight, "h5py"))
+    try:
+        import_module(library)
+    except ImportError:
+        raise InputError(
+            f"{path}: such a log is read with {library}: pip install 'magtwin[vehicles]'"
+        ) from None
+    try:
+        return read(path)
+    except InputError:
+        raise
+    except Exception as error:  # the libraries raise whatever a damaged file leads to
+        raise InputError(f"{path}: damaged, or no log of this kind ({str(error)[:120]})") from None
+
+
+def _px4(path: Path) -> Columns:
+    """ULog: the magnetometer, the local position and the attitude that PX4 estimated."""
+    from pyulog import ULog
+
+    three = [f"magnetometer_ga[{k}]" for k in range(3)]
+    sensors = {"vehicle_magnetometer": three, "sensor_combined": three, "sensor_mag": ["x", "y", "z"]}
+    topics: dict[str, Any] = {}
+    for data in ULog(str(path), [*sensors, "vehicle_local_position", "vehicle_attitude"]).data_list:
+        topics.setdefault(data.name, data.data)
+    for name, labels in sensors.items():
+        if labels[0] in topics.get(name, ()):
+            t = topics[name]["timestamp"] / 1e6
+            gauss = np.column_stack([topics[name][label] for label in labels])
+            break
+    else:
+        raise InputError(f"{path}: no magnetometer in it; it holds {', '.join(sorted(topics)) or 'none'}")
+    columns = {"t": t}
+    if place := topics.get("vehicle_local_position"):
+        at = place["timestamp"] / 1e6
+        columns |= {"x [m]": np.interp(t, at, place["y"]), "y [m]": np.interp(t, at, place["x"])}
+    turn = topics.get("vehicle_attitude")
+    if turn is None:
+        return columns | {"field [nT]": 1e5 * np.linalg.norm(gauss, axis=1)}
+    q = np.column_stack([turn[f"q[{k}]"] for k in range(4)])  # w, x, y, z: body to north, east, down
+    q *= np.cumprod(np.where(np.sum(q * np.roll(q, 1, axis=0), axis=1) < 0, -1, 1))[:, None]
+    q = np.column_stack([np.interp(t, turn["timestamp"] / 1e6, part) for part in q.T])
+    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    angles = (
+        np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)),
+        np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+    )
+    return columns | _levelled(1e5 * gauss, *angles)
+
+
+def _ardupilot(path: Path) -> Columns:
+    """DataFlash: the first compass [mG], the position and the attitude that ArduPilot estimated."""
+    from pymavlink.DFReader import DFReader_binary
+
+    rows: dict[str, list[list[float]]] = {"MAG": [], "POS": [], "ATT": []}
+    labels = {
+        "MAG": ("TimeUS", "MagX", "MagY", "MagZ"),
+        "POS": ("TimeUS", "Lng", "Lat"),
+        "ATT": ("TimeUS", "Roll", "Pitch", "Yaw"),
+    }
+    log = DFReader_binary(str(path))
+    while (message := log.recv_match(type=list(rows))) is not None:
+        kind = message.get_type()
+        if not getattr(message, "I", 0):
+            rows[kind].append([float(getattr(message, label)) for label in labels[kind]])
+    if not rows["MAG"]:
+        raise InputError(f"{path}: no message MAG in it, which holds the compass")
+    t, *mag = np.array(rows["MAG"]).T
+    columns = {"t": t / 1e6}
+    if rows["POS"]:
+        at, lon, lat = np.array(rows["POS"]).T
+        columns |= {"lon": np.interp(t, at, lon), "lat": np.interp(t, at, lat)}
+    b = 1e2 * np.column_stack(mag)
+    if not rows["ATT"]:
+        return columns | {"field [nT]": np.linalg.norm(b, axis=1)}
+    at, *degrees = np.array(rows["ATT"]).T
+    angles = (np.interp(t, at, np.unwrap(np.radians(part))) for part in degrees)
+    return columns | _levelled(b, *angles)
+
+
+def _flight(path: Path) -> Columns:
+    """HDF5: the data sets that `FLIGHT` names, all of one length."""
+    import h5py
+
+    columns: Columns = {}
+    with h5py.File(path, "r") as file:
+        known = {str(name).lower(): item for name, item in file.items() if isinstance(item, h5py.Dataset)}
+        for label, names in FLIGHT.items():
+            found = next((known[name] for name in names if name in known and known[name].ndim == 1), None)
+            if found is not None:
+                columns[label] = np.asarray(found[()], float)
+    if "field [nT]" not in columns:
+        held = ", ".join(sorted(known)[:12]) or "no data sets"
+        raise InputError(
+            f"{path}: no field in it under the names {', '.join(FLIGHT['field [nT]'])}; it has {held}"
+        )
+    rows = len(columns["field [nT]"])
+    if "x [m]" in columns:
+        columns.pop("lon", None), columns.pop("lat", None)
+    return {label: values for label, values in columns.items() if len(values) == rows}
+
+
+def _levelled(b: Array, roll: Array, pitch: Array, yaw: Array) -> Columns:
+    """Vectors in axes forward, right, down as level ones forward, left, up; and the heading from east.
+
+    Angles [rad] are those of a body in axes north, east, down.
+    """
+    x, y, z = b.T
+    right = np.cos(roll) * y - np.sin(roll) * z
+    below = np.sin(roll) * y + np.cos(roll) * z
+    forward, down = np.cos(pitch) * x + np.sin(pitch) * below, np.cos(pitch) * below - np.sin(pitch) * x
+    return {"yaw [rad]": np.pi / 2 - yaw, "bx [nT]": forward, "by [nT]": -right, "bz [nT]": -down}

@@ -1,0 +1,157 @@
+"""Walk: places of a sensor that was carried past marks, by the times at which it passed them."""
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.tables.labels import words_of
+from magtwin.tables.table import Column, Table, since_1970
+
+Array = NDArray[np.float64]
+
+NOTES = ("text", "note", "notes", "annotation", "comment", "label", "remark", "event", "description")
+"""Names of columns whose words may be places."""
+
+_PLACE = re.compile(r"\D*?([+-]?\d+(?:\.\d+)?)\s*[,;/ ]\s*(?:y\s*=?\s*)?([+-]?\d+(?:\.\d+)?)\s*\D*", re.ASCII)
+"""A place in a note: `1.5,2`, `(1.5; 2)` or `x=1.5 y=2`."""
+
+STILL_M_S2 = 0.4
+"""Standard deviation of the acceleration within a second below which nobody walks [m/s^2]."""
+
+LEAST_PAUSE_S = 1.5
+"""Shortest pause that counts [s]."""
+
+QUIET, LIVELY = 4.0, 20.0
+"""Changes of the field within a second, in standard deviations of its means over a second: below the first
+in a pause, and above the second usually. Fields that hardly change show no pauses."""
+
+
+@dataclass(frozen=True)
+class Marks:
+    """When a walker passed which places."""
+
+    t: Array
+    """Times [s], ascending, shape (M,)."""
+
+    p_xy: Array
+    """Places [m], shape (M, 2)."""
+
+    name: str
+    """Their file."""
+
+
+def marks_of(table: Table) -> Marks | None:
+    """The marks in a table: columns of time, x and y, or of time and of notes such as `1.5,2`; None if none.
+
+    Raises:
+        InputError: There is one mark only, or two at one time.
+    """
+    name = "".join(table.find("t"))
+    if not name:
+        return None
+    t, _ = since_1970(table, name)
+    if labels := table.find("x", "y"):
+        p = np.column_stack([table.numbers(label, axis) for label, axis in zip(labels, "xy", strict=True)])
+    else:
+        notes = next((label for label in table.names if set(words_of(label)) & set(NOTES)), None)
+        found = [_PLACE.fullmatch(text) for text in table.texts(notes)] if notes else []
+        if not any(found):
+            return None
+        p = np.array([[float(m[1]), float(m[2])] if m else [np.nan, np.nan] for m in found])
+    known = np.isfinite(t) & np.isfinite(p).all(axis=1)
+    order = np.flatnonzero(known)[np.argsort(t[known], kind="stable")]
+    t, p = t[order], p[order]
+    if len(t) < 2:
+        raise InputError(f"{table.path}: {len(t)} mark; a walk needs two or more, as t,x,y")
+    if len(same := np.flatnonzero(np.diff(t) <= 0)):
+        raise InputError(f"{table.path}: two marks at {t[same[0]]:g} s; a walker passes one place at a time")
+    return Marks(t, p, table.path.name)
+
+
+def walked(table: Table, marks: Marks, moving: tuple[Array, Array] | None = None) -> Table:
+    """A table of readings with the columns x and y of a walk: from mark to mark at a steady pace.
+
+    In pauses the walker stands still. Rows before the first mark and behind the last have no place.
+
+    Args:
+        table: Readings with a column of time.
+        marks: The marks, in the clock of the table or in seconds since its first row.
+        moving: Times [s] and accelerations [m/s^2] of the walker, shapes (K,) and (K, 3), by which pauses are
+            found. Default: pauses are where the field does not change.
+
+    Raises:
+        InputError: The table has no times, or marks and rows share no time.
+    """
+    name = "".join(table.find("t"))
+    if not name:
+        raise InputError(f"{table.path}: no column of time; marks are joined to readings by their times")
+    t, _ = since_1970(table, name)
+    begin, end = float(np.nanmin(t)), float(np.nanmax(t))
+    at, notes = marks.t, [f"places from {len(marks.t)} marks of {marks.name}, at a steady pace between them"]
+    if at[-1] < begin or at[0] > end:
+        if not -1 <= at[0] < at[-1] <= 1.05 * (end - begin) + 1:
+            raise InputError(
+                f"{table.path}: {begin:.10g} to {end:.10g} s, and {marks.name}: {at[0]:.10g} to "
+                f"{at[-1]:.10g} s, have no time in common; count both from the start of the log"
+            )
+        at = at + begin
+        notes.append(f"the times of {marks.name} from the start of {table.path.name}")
+    stills = _stills(*moving) if moving else _quiet(table, t)
+    stills = [(a, b) for a, b in stills if b > at[0] and a < at[-1]]
+    if stills:
+        by = "the acceleration" if moving else "a field that did not change"
+        notes.append(f"{len(stills)} pauses, {sum(b - a for a, b in stills):.0f} s in all, by {by}")
+    way_at, way = _moved(at, stills), _moved(t, stills)
+    way_at = np.where(np.diff(way_at, prepend=-np.inf) > 0, way_at, way_at + 1e-9 * np.arange(len(at)))
+    p = np.column_stack([np.interp(way, way_at, part) for part in marks.p_xy.T])
+    p[~((t >= at[0]) & (t <= at[-1]))] = np.nan
+    columns = [c for c in table.columns if c.name not in ("x", "y")]
+    placed = (Column(axis, part, table.path, None) for axis, part in zip("xy", p.T, strict=True))
+    return Table((*columns, *placed), (*table.notes, *notes), table.comments)
+
+
+def _moved(t: Array, stills: list[tuple[float, float]]) -> Array:
+    """Time on the move until each time [s], without pauses."""
+    rest = sum((np.clip(t, a, b) - a for a, b in stills), start=np.zeros(len(t)))
+    return np.asarray(t - rest)
+
+
+def _stills(t: Array, acceleration: Array) -> list[tuple[float, float]]:
+    """Begin and end of the pauses of a walker [s], by accelerations."""
+    second = np.floor(2 * (t - t[0])).astype(np.intp)  # halves of a second
+    count = np.maximum(np.bincount(second), 1)
+    spread = np.zeros(len(count))
+    for part in acceleration.T:
+        mean = np.bincount(second, part) / count
+        spread += np.bincount(second, (part - mean[second]) ** 2) / count
+    return _stretches(t[0] + np.arange(len(count) + 1) / 2, np.sqrt(spread) < STILL_M_S2)
+
+
+def _quiet(table: Table, t: Array) -> list[tuple[float, float]]:
+    """Begin and end of the pauses of a walker [s], by a field that does not change."""
+    names = table.find("field") or table.find("bx", "by", "bz")
+    if not names or len(t) < 100:
+        return []
+    b = np.linalg.norm([table.numbers(name) for name in names], axis=0)
+    good = np.isfinite(b) & np.isfinite(t)
+    b, t = b[good], t[good]
+    window = int(1 / max(float(np.median(np.diff(t))), 1e-3))
+    if window < 5 or len(b) < 4 * window:
+        return []
+    noise = 1.4826 * float(np.median(np.abs(np.diff(b, 2)))) / np.sqrt(6 * window)
+    mean = np.convolve(b, np.ones(window) / window, "same")
+    change = np.abs(mean[window:] - mean[:-window])
+    if noise == 0 or np.median(change) < LIVELY * noise:
+        return []
+    edges = (t[window // 2 :])[: len(change) + 1]
+    return _stretches(edges, change < QUIET * noise)
+
+
+def _stretches(edges: Array, flags: NDArray[np.bool_]) -> list[tuple[float, float]]:
+    """Begin and end of stretches of flags of `LEAST_PAUSE_S` or more."""
+    change = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    pairs = [(float(edges[a]), float(edges[b])) for a, b in change.reshape(-1, 2)]
+    return [(a, b) for a, b in pairs if b - a >= LEAST_PAUSE_S]
