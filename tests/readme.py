@@ -1,8 +1,8 @@
-"""Type README's commands in an empty folder, in order, and check the output that README quotes.
+"""Type the commands of README and of docs/tour.md in an empty folder, and check the output that they quote.
 
     python tests/readme.py [--keep FOLDER] [--first TEXT]
 
-`make readme` runs it. Every line of README's shell blocks is run as it stands, but for `CHANGES`, which
+`make readme` runs it. Every line of their shell blocks is run as it stands, but for `CHANGES`, which
 shorten live commands and give them keys, and `LEFT_OUT`, which need a window or the network. Python blocks
 are run in the same folder. Blocks of the language `text` are quoted output: the commands before must have
 printed each line, with numbers at most `NEAR` off. my_robot.urdf, which a reader brings along, is that of
@@ -27,8 +27,11 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 REAL = ROOT.parent / "shared" / "data"
 
+PAGES = ("README.md", "docs/tour.md")
+
 LEFT_OUT = {
     r"make ": "CI runs it by itself",
+    r"git ": "the checkout is here",
     r"magtwin view ": "needs a window",
     r"magtwin fetch ": "needs the network; the folder is copied from the real data",
 }
@@ -54,8 +57,8 @@ readings within 90 % intervals."""
 
 
 def steps() -> Iterator[tuple[str, str]]:
-    """README's commands ("run"), Python blocks ("python") and lines of output ("text"), in order."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    """Commands ("run"), Python blocks ("python") and lines of output ("text") of the pages, in order."""
+    text = "".join((ROOT / page).read_text(encoding="utf-8") for page in PAGES)
     for language, block in re.findall(r"^```(\w*)\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
         if language == "python":
             yield "python", block
@@ -83,7 +86,7 @@ def type_all(folder: Path, first: str) -> None:
         skipping = skipping and first not in text
         if kind == "text":
             if not skipping and not any(near(text, line) for line in printed):
-                sys.exit("README quotes a line that was not printed:\n" + "\n".join([text, "", *printed]))
+                sys.exit("a page quotes a line that was not printed:\n" + "\n".join([text, "", *printed]))
             continue
         line = text
         if kind == "python":
