@@ -158,7 +158,7 @@ def expected(path: str | os.PathLike[str], noun: str) -> Path:
 def scene_file(scene: str | Path) -> Path:
     """The file of a stage, of a folder that `author_scene` wrote, or of a shipped scene's name such as "lab".
 
-    A folder goes before a shipped scene of its name only if it holds a scene. `./lab` is always the folder.
+    A folder goes before a shipped scene of its name only if it holds a scene.
 
     Raises:
         InputError: The file is missing, there is no scene of that name, or it is a TOML.
