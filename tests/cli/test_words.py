@@ -1,10 +1,14 @@
 """Names of commands: groups, other words for them, old names, examples, and what is said of a wrong name."""
 
+import ast
 import re
 import shlex
+from pathlib import Path
 
 import pytest
+from test_options import _names, commands
 
+import magtwin
 from magtwin.cli import MODULES, load, main
 from magtwin.cli.app import app
 from magtwin.cli.help import _examples, examples, front
@@ -33,9 +37,7 @@ reproducibility; ros replay: replay playback; help: man docs help-me
 PAIRS = [line.split(": ") for line in " ".join(MEANT.split()).split("; ")]
 
 
-@pytest.mark.parametrize(
-    ("command", "word"), [(n, w) for n, words in PAIRS for w in words.split()]
-)
+@pytest.mark.parametrize(("command", "word"), [(n, w) for n, words in PAIRS for w in words.split()])
 def test_an_everyday_word_leads_to_its_command(command, word):
     assert command in guess(word)
 
@@ -129,3 +131,23 @@ def test_each_command_has_two_examples_and_quick_ones_work_in_an_empty_folder(tm
     assert (tmp_path / "again.usdc").exists()
     assert option_meant("overwrite") == ["force"]
     assert all(len(examples(command)) == 2 for command in MODULES)
+
+
+FLAG = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]+")
+OTHERS = (
+    "--allow --debug --help --version --json-output --output --verify --src --dst --unordered --bind --port "
+)
+OTHERS += "--web-viewer --hide-welcome-screen --headless --window-size --time-s --quantity"
+
+
+def test_an_option_that_a_message_names_is_one_of_its_command():
+    options = {" ".join(words): _names(group) | set(OTHERS.split()) for words, group in commands()}
+    for file in Path(magtwin.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            parts = node.values if isinstance(node, ast.JoinedStr) else [node]
+            text = "".join(str(getattr(part, "value", "X")) for part in parts if isinstance(part, ast.expr))
+            assert {*FLAG.findall(text)} <= set().union(*options.values()), (file, text)
+            for said in (re.split("[`;,)]", part)[0] for part in text.split("magtwin ")[1:]):
+                starts = (" ".join(said.split()[:k]) for k in (3, 2, 1))
+                known = next((start for start in starts if start in options), None)
+                assert known is None or {*FLAG.findall(said)} <= options[known], (file, said)
