@@ -70,6 +70,7 @@ def test_every_command_is_in_a_group_and_the_first_page_fits_a_terminal():
         ("create scene", "did you mean `magtwin scene`: Author"),
         ("map draw", "no command 'map draw'; did you mean `magtwin plot`"),
         ("dataset make", "did you mean `magtwin dataset build`"),
+        ("rnu", "did you mean `magtwin run`"),
         ("xyzzy", "no command 'xyzzy'; magtwin help lists"),
         ("gone/run.parquet", "no such file"),
         ("run", "magtwin run needs SCENE: USD stage to drive in"),
