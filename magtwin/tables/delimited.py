@@ -6,6 +6,7 @@ headers that are repeated, decimal commas, marks between thousands, and a last l
 
 import codecs
 import csv
+import itertools
 import math
 import os
 import re
@@ -151,6 +152,7 @@ def read_delimited(
     first = _header(rows)
     if prose or first:
         notes.append(f"line {rows[first][0]} as the header, and the lines above it as prose")
+    above = [comment for comment in above if comment[0] < rows[first][0]]
     names, rows = _names(path, rows[first:], above, between)
     if not rows:
         raise InputError(f"{path}: no rows below the header; expected {wanted}")
@@ -249,9 +251,9 @@ def _names(path: Path, rows: _Rows, above: _Lines, between: str | None) -> tuple
     if _is_header(rows[0][1]):
         return [word.strip() for word in rows[0][1]], rows[1:]
     names: list[str] = []
-    for comment in above:
+    for comment, mark in itertools.product(above, dict.fromkeys((between, *",;\t", None))):
         with suppress(InputError):  # prose with unpaired quotes
-            ((_, header),) = _words(path, [comment], between)
+            ((_, header),) = _words(path, [comment], mark)
             names = [word.strip() for word in header] if len(header) == len(rows[0][1]) else names
     return names, rows
 
@@ -294,12 +296,11 @@ def _without_comments(lines: _Lines, notes: list[str]) -> tuple[_Lines, _Lines, 
     """Comments, those above the rows that may be a header, other lines, and the mark of a line `sep=;`."""
     match = re.fullmatch(r'"?sep=(\S)"?', lines[0][1].strip(), re.IGNORECASE) if lines else None
     lines = lines[1:] if match else lines
-    slashed = bool(lines) and bool(_SLASH.match(lines[0][1]))
+    slashed = any(_SLASH.match(line) for _, line in lines[:MOST_ABOVE])
     others = [(number, line) for number, line in lines if not _is_comment(line, slashed)]
-    first = others[0][0] if others else math.inf
     above = [
         (number, text.lstrip(text[0]))
-        for number, text in ((number, line.strip()) for number, line in lines if number < first)
+        for number, text in ((number, line.strip()) for number, line in lines if _is_comment(line, slashed))
         if re.search(r"\w", text) and not _REMARK.match(text)
     ]
     comments = [row for row in lines if row[1].lstrip().startswith("#") and _is_comment(row[1])]
@@ -314,7 +315,7 @@ def _is_comment(line: str, slashed: bool = False) -> bool:
     """Whether a line begins with `#` and not with the error of a spreadsheet, or with `/` in such a file."""
     begun = line.lstrip()
     if begun.startswith("/"):
-        return slashed and bool(_SLASH.match(line))
+        return slashed
     return begun.startswith("#") and not _ERROR.fullmatch(re.split(r"[,;\t]", line, maxsplit=1)[0])
 
 
@@ -357,7 +358,15 @@ def _separator(lines: _Lines) -> tuple[str | None, int]:
     """
     begun = [line for _, line in lines[:LOOKED]]
     found = _mark(begun) or (_mark(begun[:-1]) if 2 < len(lines) <= LOOKED else None)
-    return found or (next((mark for mark in ",;\t" if mark in begun[0]), None), 0)
+    return found or _blanks(begun) or (next((mark for mark in ",;\t" if mark in begun[0]), None), 0)
+
+
+def _blanks(lines: Sequence[str]) -> tuple[None, int] | None:
+    """Number of lines of prose above rows of numbers with blanks between; None if these are no such rows."""
+    words = [line.split() for line in lines]
+    rows = [len(row) == len(words[-1]) > 1 and all(math.isfinite(number_of(w)) for w in row) for row in words]
+    above = rows.index(True) if True in rows else len(rows)
+    return (None, above) if all(rows[above:]) and 0 < above < min(MOST_ABOVE, len(rows) - 1) else None
 
 
 def _mark(lines: Sequence[str]) -> tuple[str | None, int] | None:

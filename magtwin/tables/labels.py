@@ -78,11 +78,13 @@ def meaning_of(text: str, symbol: str) -> Meaning | None:
             name, behind = "_".join(words[begin:end]), words[end:]
             if name not in quantity.places:
                 continue
-            last = "_".join(word for word in behind if word not in _LEFT_OUT)
-            is_unit = not unit and last in quantity.units and last not in IN_BRACKETS
-            if is_unit or quantity.around.issuperset(behind):
-                around = begin + (0 if is_unit else len(behind))
-                return Meaning(quantity.places[name], around, last if is_unit else unit)
+            if quantity.around.issuperset(behind):
+                return Meaning(quantity.places[name], begin + len(behind), unit)
+            for cut in range(len(behind) if not unit else 0):
+                last = "_".join(word for word in behind[cut:] if word not in _LEFT_OUT)
+                known = last in quantity.units and last not in IN_BRACKETS
+                if known and quantity.around.issuperset(behind[:cut]):
+                    return Meaning(quantity.places[name], begin + cut, last)
     return None
 
 

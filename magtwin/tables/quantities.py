@@ -108,7 +108,10 @@ _AT = frozenset(
         *("utm", "local", "coordinate", "koordinate", "coordonnee", "coordenada", "coordinata", "proj"),
     )
 )
-_ON_EARTH = frozenset(("gps", "gnss", "geo", "wgs84", "pos", "position", "decimal", "dd"))
+_ON_EARTH = frozenset(("location", "gps", "gnss", "geo", "wgs84", "pos", "position", "decimal", "dd"))
+_READINGS = frozenset(
+    ("strength", "value", "reading", "raw", "sensor", "measured", "calibrated", "avg", "mean", "corrected")
+)
 _SENT = frozenset(("twist", "cmd", "vel", "msg", "data", "header"))
 _VECTORS = (
     *("b{}", "b_{}", "m{}", "mag_{}", "mag{}", "field_{}", "magnetic_field_{}", "mag_field_{}"),
@@ -144,18 +147,8 @@ QUANTITIES: dict[str, Quantity] = {
         (
             *("t", "time", "timestamp", "stamp", "seconds_elapsed", "elapsed", "time_since_start", "times"),
             *("seconds", "elapsed_time", "zeit", "uhrzeit", "zeitstempel", "temps", "heure", "horodatage"),
-            *(
-                "tiempo",
-                "hora",
-                "tempo",
-                "ora",
-                "datetime",
-                "date_time",
-                "utc",
-                "utc_time",
-                "gps_time",
-                "epoch",
-            ),
+            *("tiempo", "hora", "tempo", "ora", "datetime", "date_time", "utc", "utc_time"),
+            *("gps_time", "epoch", "relative_time"),
         ),
         TIMES,
         _SENT,
@@ -180,8 +173,10 @@ QUANTITIES: dict[str, Quantity] = {
             *("total_intensity", "total_magnetic_intensity", "magnetic_intensity", "flux_density", "mag1"),
             *("magnetic_flux_density", "total_magnetic_field", "raw_mag", "mag_raw", "mag_1", "mag_1_uc"),
             *("absolute_magnetic_field", "intensity", "strength", "field_strength", "scalar"),
+            *("magnetic_rotation_sensor", "magnetometer"),
         ),
         FIELDS,
+        _READINGS,
     ),
     **{f"b{axis}": Quantity(tuple(name.format(axis) for name in _VECTORS), FIELDS) for axis in "xyz"},
     "v": Quantity(

@@ -32,6 +32,7 @@ _EPOCHS = ((1e17, 1e9, "ns"), (1e14, 1e6, "us"), (1e11, 1e3, "ms"))
 """Least median of times since 1970, ticks per second and unit; below them are seconds."""
 
 _DATE = re.compile(r"\d{1,4}[-/.](\d{1,2}|[A-Za-z]{3})[-/.]\d{1,4}", re.ASCII)
+_CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:\.\d*)?))?", re.ASCII)
 _DAYS = ("%Y-%m-%d", "%d-%m-%Y", "%m-%d-%Y", "%d-%b-%Y")
 """Orders of a date, with a hyphen for any mark."""
 
@@ -202,9 +203,10 @@ class Table:
     def times(self, name: str) -> Array:
         """The times of a column [s], shape (N,); nan for cells that are empty or nan.
 
-        They are numbers, in the unit of the name or in seconds; or dates and times, which become seconds
-        since 1970: as in ISO 8601, as `2025/11/22 08:26:40` or `22-Nov-2025 08:26:40`, or with day and month
-        in the order that the column proves by a number above 12. One without a zone is in UTC.
+        They are numbers, in the unit of the name or in seconds; times of day, which become seconds since
+        midnight, beyond the next midnight too; or dates and times, which become seconds since 1970: as in
+        ISO 8601, as `2025/11/22 08:26:40` or `22-Nov-2025 08:26:40`, or with day and month in the order that
+        the column proves by a number above 12. One without a zone is in UTC.
 
         Raises:
             InputError: There is no such column, a cell is neither, or day and month cannot be told apart;
@@ -213,6 +215,9 @@ class Table:
         column = self.column(name)
         is_text = not isinstance(column.cells, np.ndarray) or column.cells.dtype.kind == "O"
         texts = self.texts(name) if is_text else []
+        if texts and all(clocks := [_CLOCK.fullmatch(text) for text in texts]):
+            seconds = np.array([3600 * int(m[1]) + 60 * int(m[2]) + float(m[3] or 0) for m in clocks if m])
+            return seconds + 86_400.0 * np.cumsum(np.diff(seconds, prepend=seconds[0]) < -43_200)
         if not any(map(_DATE.match, texts)):
             for row, text in enumerate(texts):
                 if np.isinf(number_of(text)):

@@ -69,8 +69,12 @@ def table_of_log(path: Path, waypoints: Path | None = None) -> Table:
     Raises:
         InputError: There is no field in it, or a part is damaged.
     """
-    parts = _parts(path) if is_log(path) else {path.stem: read_table(path)}
-    name, field = _field(path, parts)
+    if is_log(path):
+        parts = _parts(path)
+        name, field = _field(path, parts)
+    else:
+        name, field = path.stem, read_table(path)
+        parts = {name: field}
     marks = marks_of(read_table(waypoints)) if waypoints else _marks(parts, name)
     if waypoints and marks is None:
         raise InputError(f"{waypoints}: no marks; a row is t,x,y, or t and a note such as 1.5,2")

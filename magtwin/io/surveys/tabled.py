@@ -122,6 +122,7 @@ def left_out(known: NDArray[np.bool_]) -> str:
 def _complete(table: Table, told: Columns, *, placed: bool = True) -> tuple[Columns, list[str]]:
     """Columns and unit, with missing ones found by name and size; and what was found so."""
     taken = list(table.notes)
+    told = _by_place(table, told, taken) if placed and told == Columns() else told
     columns = _placed(table, told, taken) if placed else told
     if not (columns.heading or columns.quaternion):
         columns = replace(columns, heading="".join(table.find("heading")))
@@ -179,6 +180,21 @@ def _placed(table: Table, told: Columns, taken: list[str]) -> Columns:
     if not (told.x or told.y):
         taken += [f"{note} (--x, --y)" for note in notes if note.endswith(" as x and y")]
     return columns
+
+
+def _by_place(table: Table, told: Columns, taken: list[str]) -> Columns:
+    """Columns x, y, field or t, x, y, field of a table without a header, if the last alone may be a field."""
+    count = len(table.columns)
+    if any(column.name for column in table.columns) or count not in (3, 4):
+        return told
+    sizes = [unit_by_size(table.numbers(name)) for name in table.names]
+    if sizes[-1] is None or any(sizes[-3:-1]):
+        return told
+    *time, x, y, field = table.names
+    taken.append(
+        f"columns {', '.join(table.names)} as {'t, ' * len(time)}x, y and the field (--x, --y, --field)"
+    )
+    return replace(told, x=x, y=y, field=field, time="".join(time))
 
 
 def _positions(table: Table, columns: Columns, taken: list[str]) -> tuple[Array, str]:

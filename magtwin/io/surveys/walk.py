@@ -18,6 +18,9 @@ NOTES = ("text", "note", "notes", "annotation", "comment", "label", "remark", "e
 _PLACE = re.compile(r"\D*?([+-]?\d+(?:\.\d+)?)\s*[,;/ ]\s*(?:y\s*=?\s*)?([+-]?\d+(?:\.\d+)?)\s*\D*", re.ASCII)
 """A place in a note: `1.5,2`, `(1.5; 2)` or `x=1.5 y=2`."""
 
+LEAST_COVERED = 0.1
+"""Share of the log's time below which marks must be in another unit."""
+
 STILL_M_S2 = 0.4
 """Standard deviation of the acceleration within a second below which nobody walks [m/s^2]."""
 
@@ -99,6 +102,11 @@ def walked(table: Table, marks: Marks, moving: tuple[Array, Array] | None = None
             )
         at = at + begin
         notes.append(f"the times of {marks.name} from the start of {table.path.name}")
+    if (covered := (min(at[-1], end) - max(at[0], begin)) / max(end - begin, 1e-9)) < LEAST_COVERED:
+        raise InputError(
+            f"{table.path}: {marks.name} covers {100 * covered:.2g} % of its {end - begin:.6g} s; "
+            "give both times in one unit, such as t [ms]"
+        )
     stills = _stills(*moving) if moving else _quiet(table, t)
     stills = [(a, b) for a, b in stills if b > at[0] and a < at[-1]]
     if stills:
