@@ -3,6 +3,9 @@
 An output is written in a hidden folder beside its place, is brought to the disk, and is then renamed. A
 killed process leaves its hidden folder; each output is then as it was before, or whole and new.
 
+A command asks for its names by `free`: an output that exists is not in the way, NAME-1 is made. Functions
+refuse an output that exists, but for `force=True`.
+
 A link at the place of an output is itself replaced: what it leads to stays as it is, so that no link in a
 stranger's folder leads a write elsewhere. Only a file that is rewritten in its place is found through a link.
 """
@@ -15,10 +18,12 @@ import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
+from zlib import crc32
 
 from magtwin.errors import InputError
 
@@ -36,6 +41,9 @@ _WRITTEN = re.compile(
 
 _inputs: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())
 """Files and folders that the command reads, which no output may remove."""
+
+_names: ContextVar["_Names | None"] = ContextVar("names", default=None)
+"""Names of the command's outputs; None outside of a command."""
 
 _pending: ContextVar["tuple[list[_Aside], list[Callable[[], object]]] | None"] = ContextVar(
     "pending", default=None
@@ -62,6 +70,88 @@ def check_free(path: str | os.PathLike[str], *, force: bool = False, in_place: b
     return path
 
 
+def free(*paths: Path, beside: Iterable[str] = (), force: bool = False) -> list[Path]:
+    """Names for a command's outputs that nothing has yet: NAME, else NAME-1, NAME-2, ..., all of one number.
+
+    Until the command ends, no other command is given the same names: a hidden file beside each of them is
+    created and locked. A killed command leaves that file, which the next one takes over and removes.
+
+    Args:
+        paths: The names asked for. Their folders are created; those that remain empty are removed.
+        beside: Endings of what is made beside an output: ".md" stands for NAME.md.
+        force: Whether outputs that exist are replaced: the names are those asked for.
+
+    Raises:
+        InputError: A folder cannot be written, or the path cannot be the name of an output.
+    """
+    if force:
+        return [check_free(path, force=True) for path in paths]
+    for path in paths:
+        if wrong := _wrong(path):
+            raise InputError(f"{path if str(path).strip() else repr(str(path))}: {wrong}")
+    names, endings = _names.get() or _Names(), tuple(beside)
+    for number in count():
+        found = [path.with_name(f"{path.stem}-{number}{path.suffix}") if number else path for path in paths]
+        others = (path.with_name(f"{path.stem}{ending}") for path in found for ending in endings)
+        if not any(map(os.path.lexists, (*found, *others))) and all(map(names.claim, found)):
+            names.instead.update(zip(paths, found, strict=True) if number else ())
+            return found
+    raise AssertionError
+
+
+def instead() -> dict[Path, Path]:
+    """Names that `free` gave in place of those asked for, so far in this command."""
+    names = _names.get()
+    return {} if names is None else names.instead
+
+
+@dataclass
+class _Names:
+    """Names that a command claimed, and what is undone at its end."""
+
+    end: ExitStack | None = None
+    instead: dict[Path, Path] = field(default_factory=dict)
+
+    def claim(self, path: Path) -> bool:
+        """Keep a name from other commands; False if one has it. Without `end`, or locks, nothing is kept."""
+        try:
+            import fcntl
+        except ImportError:
+            return True
+        if self.end is None:
+            return True
+        lock = path.with_name(f".{path.name[:60]}{HIDDEN}{crc32(os.fsencode(path.name)):08x}")
+        try:
+            for folder in reversed([folder for folder in path.parents if not folder.exists()]):
+                folder.mkdir(exist_ok=True)
+                self.end.callback(_remove_empty, folder.absolute())
+            number = os.open(lock, os.O_RDWR | os.O_CREAT, 0o600)
+        except OSError as error:
+            reason = f"cannot be written ({error.strerror})"
+            raise InputError(f"{path}: {reason}; give a name in another folder") from error
+        try:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            mine = os.path.samestat(os.fstat(number), lock.stat())
+        except BlockingIOError:
+            os.close(number)
+            return False
+        except FileNotFoundError:
+            mine = False
+        except OSError:
+            mine = True  # a file system without locks
+        if not mine:  # the command that had it ended in this moment, and removed the file
+            os.close(number)
+            return self.claim(path)
+        self.end.callback(os.close, number)
+        self.end.callback(lock.absolute().unlink, missing_ok=True)
+        return not os.path.lexists(path)
+
+
+def _remove_empty(folder: Path) -> None:
+    with suppress(OSError):
+        folder.rmdir()
+
+
 def _wrong(path: Path) -> str:
     """Why there can be no output of this name, and what to do; "" if there can."""
     real = Path(os.path.realpath(path))
@@ -78,7 +168,10 @@ def _wrong(path: Path) -> str:
     if any("\udc80" <= letter <= "\udcff" for letter in path.name):
         return "its name is not UTF-8, and file formats store names as UTF-8; give another"
     above = next(folder for folder in path.parents if folder.exists())
-    return "" if above.is_dir() else f"cannot be written, as {above} is no folder; give another name"
+    if not above.is_dir():
+        return f"cannot be written, as {above} is no folder; give another name"
+    may = path.is_symlink() or os.access(above, os.W_OK | os.X_OK)  # in_place, a link leads elsewhere
+    return "" if may else f"cannot be written, as {above.absolute()} is read-only; give a name elsewhere"
 
 
 def _doomed(folder: Path, new: Path) -> str:
@@ -159,16 +252,21 @@ def output(
 
 @contextmanager
 def reading(files: Iterable[Path]) -> Iterator[None]:
-    """Let no output of the block remove these files and folders; those that do not exist are ignored."""
+    """A command that reads files and folders: no output of the block removes them, and `free` claims names.
+
+    Files that do not exist are ignored.
+    """
     named = set[Path]()
     for file in files:
         with suppress(OSError, ValueError):  # a text that is too long for a name
             named |= {Path(os.path.realpath(file))} if file.exists() else set()
-    token = _inputs.set(tuple(sorted(named)))
-    try:
-        yield
-    finally:
-        _inputs.reset(token)
+    with ExitStack() as end:
+        tokens = _inputs.set(tuple(sorted(named))), _names.set(_Names(end))
+        try:
+            yield
+        finally:
+            _inputs.reset(tokens[0])
+            _names.reset(tokens[1])
 
 
 def not_read(value: str | Path) -> None:

@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from magtwin.errors import InputError
 from magtwin.files.file import existing
 from magtwin.files.kinds import COMMANDS, RUN, kind_of
-from magtwin.files.outputs import check_free, output, transaction
+from magtwin.files.outputs import check_free, free, output, transaction
 from magtwin.io.formats import FORMATS, format_of, format_to_write, read_run, write_run
 from magtwin.path import CASES, PATHS, read_path_csv
 from magtwin.path import Path as Planned
@@ -151,7 +151,7 @@ class Outputs:
 
     @classmethod
     def of(cls, out: "list[Path] | tuple[Path, ...]", *, scans: bool = False, **options: Any) -> "Outputs":
-        """Outputs by their names; refuses unknown formats, two outputs of one name, and files that exist."""
+        """Outputs by their names; refuses unknown formats and two outputs of one name."""
         folders = [path for path in out if not path.suffix]
         files = tuple(path for path in out if path.suffix)
         if len(folders) > 1:
@@ -169,9 +169,22 @@ class Outputs:
             if value is not None and not any(takes in format_of(file).takes for file in files):
                 kind = "a bag" if takes == "units" else "a USD layer"
                 raise InputError(f"`{name}` is for {kind}; name one as an output, or drop it", parameter=name)
-        for target in targets:
-            check_free(target, force=made.force)
         return made
+
+    def free(self, robots: Iterable[str] = ()) -> "Outputs":
+        """The outputs by names that nothing has yet; see `magtwin.files.outputs.free`.
+
+        Args:
+            robots: Names of the robots, where several are written, each to files of its own.
+        """
+        named, kinds = [*([self.folder] if self.folder else []), *self.files], {f.suffix for f in self.files}
+        scans = [".scans.parquet"] if self.scans else []
+        ends = [*scans, f"{named[0].suffix}.parts"]
+        ends += [f".{robot}{end}" for robot in robots for end in (*kinds, *ends)]
+        found = free(*named, beside=ends, force=self.force)
+        files = tuple(found[len(found) - len(self.files) :])
+        tables = tuple(_scans_of(file) for file in files if scans and file.suffix.lower() == ".parquet")
+        return replace(self, folder=found[0] if self.folder else None, files=files, scans=tables)
 
     @property
     def targets(self) -> list[Path]:
