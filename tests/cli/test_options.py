@@ -103,7 +103,7 @@ def test_doctor_lists_extras_and_how_to_install_them(capsys):
     main(["doctor", "--json"])
     found = json.loads(capsys.readouterr().out)
     assert found["extras"]["physics"]["install"] == "pip install 'magtwin[physics]'"
-    assert {"Rerun viewer", "Vulkan", "Newton", "NVIDIA validator"} <= found["tools"].keys()
+    assert {"rerun_viewer", "vulkan", "newton", "nvidia_validator"} <= found["tools"].keys()
     main(["doctor"])
     assert "pip install" in capsys.readouterr().out
 

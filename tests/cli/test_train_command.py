@@ -183,7 +183,7 @@ def kinds(data, tmp_path_factory):
 def test_what_is_told_of_a_kind_is_its_own_error_beside_the_naive_and_the_ridges(data, kinds, kind):
     out, printed = kinds[kind]
     predictor, figures = load_predictor(out), printed["figures"]
-    assert figures["kind"]["value"] == predictor.kind == kind
+    assert figures["kind"] == predictor.kind == kind
     errors, naive, inside, ridge = [], [], [], []
     peer = load_predictor(kinds["linear"][0])  # on the set "circular", as the baseline
     for _, run in open_dataset(data).runs(["f", "g"]):
@@ -192,10 +192,10 @@ def test_what_is_told_of_a_kind_is_its_own_error_beside_the_naive_and_the_ridges
         inside.append(errors[-1] <= 1.645 * sd)
         naive.append(np.abs(predictor.metadata["label_mean_nt"] - run["label_nt"]))
         ridge.append(np.abs(peer.predict(features(run, peer.features))[0] - run["label_nt"]))
-    assert figures["test MAE"]["value"] == pytest.approx(np.mean(errors))
-    assert figures["test naive MAE"]["value"] == pytest.approx(np.mean(naive))
-    assert figures["test ridge MAE"]["value"] == pytest.approx(np.mean(ridge))
-    assert figures["test coverage"]["value"] == pytest.approx(np.mean(inside), abs=0.003)
+    assert figures["test_mae_nt"] == pytest.approx(np.mean(errors))
+    assert figures["test_naive_mae_nt"] == pytest.approx(np.mean(naive))
+    assert figures["test_ridge_mae_nt"] == pytest.approx(np.mean(ridge))
+    assert figures["test_coverage"] == pytest.approx(np.mean(inside), abs=0.003)
     assert np.mean(errors) < 0.8 * np.mean(naive)
     row = f"{np.mean(errors) / np.mean(naive):.3f} | {np.mean(ridge):.1f} |"
     assert row in out.with_suffix(".md").read_text()

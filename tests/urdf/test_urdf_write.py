@@ -342,7 +342,7 @@ def test_the_command_converts_both_ways_and_lists_what_is_left_out(tmp_path, cap
     out = tmp_path / "back.urdf"
     main(["robot", str(shipped("robots", "turtlebot4", "turtlebot4.usda")), "--out", str(out), "--json"])
     said = json.loads(capfd.readouterr().out)
-    assert said["figures"]["links"]["value"] == len(read_description(out).links)
+    assert said["figures"]["links"] == len(read_description(out).links)
     assert "MagtwinMagnetometerAPI" in said["metadata"]["notes"][0]
     for words, message in (
         (["--out", str(out), "--fix-base"], "without other options than --force"),
