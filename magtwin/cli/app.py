@@ -19,7 +19,7 @@ from cyclopts.exceptions import CycloptsError
 from magtwin.cli.options import Json, Quiet
 from magtwin.cli.progress import watched
 from magtwin.cli.settings import Environment, Settings, is_setting
-from magtwin.cli.terminal import Done, output_mode, print_error
+from magtwin.cli.terminal import Done, output_mode, print_error, print_json, refusal
 from magtwin.errors import TERMINATED, CalibrationWarning, InputError, MismatchWarning, RepairWarning
 from magtwin.files.folders import allow
 from magtwin.version import __version__
@@ -57,6 +57,9 @@ _TOO_LITTLE = re.compile(r"can't allocate memory|out of memory|std::bad_alloc", 
 _running: list[App] = []
 """The command that is running."""
 
+_typed: list[str] = []
+"""The arguments."""
+
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the `magtwin` command; `arguments` default to those of the command line."""
@@ -64,6 +67,7 @@ def main(arguments: list[str] | None = None) -> None:
     debug = "--debug" in arguments
     _end_by_exceptions()
     _running.clear()
+    _typed[:] = arguments
     try:
         arguments, folders = _allowed([a for a in arguments if a != "--debug"])
         with watched(), _warnings_in_lines(), allow(*folders):
@@ -294,4 +298,6 @@ def _warnings_in_lines() -> Iterator[None]:
 
 def _fail(text: str, status: int = 1) -> None:
     print_error(text, style="1;31" if status == 2 else "")
+    if "--json" in _typed:
+        print_json({"error": refusal(text)})
     sys.exit(status)

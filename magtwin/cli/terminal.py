@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import shlex
 import shutil
 import sys
@@ -16,7 +17,7 @@ from typing import Any, TextIO, cast
 from magtwin.cli.progress import announce, current, progress, silence, step
 from magtwin.errors import InputError
 from magtwin.report.report import jsonable
-from magtwin.report.summary import aligned, clipped, printable, printable_lines
+from magtwin.report.summary import aligned, clipped, listed, printable, printable_lines
 
 __all__ = ["announce", "printable", "progress", "silence", "step"]  # commands import these from here too
 
@@ -25,6 +26,9 @@ WIDE = 100_000
 
 MOST_LINES, MOST_FIGURES, MOST_NOTES = 12, 5, 5
 """Most lines, figures and notes that a command prints; `magtwin info`, pages and --json have all."""
+
+ORIGIN = ("source", "sources", "licences", "columns")
+"""Lists of a report that only `magtwin info` prints."""
 
 FLAG = "flag_"
 """Figures of this beginning count readings in doubt, and are printed in one line."""
@@ -61,7 +65,8 @@ class Done:
 
         wrote = [str(path) for path in (self.wrote if isinstance(self.wrote, tuple) else (self.wrote,))]
         following = [shlex.join(map(str, words)) for words in self.next]
-        renamed = {str(asked): str(new) for asked, new in instead().items() if str(new) in wrote}
+        written = [folder for path in wrote for folder in (Path(path), *Path(path).parents)]
+        renamed = [str(asked) for asked, new in instead().items() if new in written]
         other = f"{' and '.join(renamed)} exist{'s' if len(renamed) == 1 else ''}"
         if _mode.json or _mode.quiet:
             if renamed:
@@ -70,7 +75,7 @@ class Done:
             tail = []
             if wrote:
                 tail = [f"{other}: wrote {', '.join(wrote)}" if renamed else f"Wrote {', '.join(wrote)}"]
-                tail[0] += f": {self.text}" if self.text else ""
+                tail[0] += f": {self.text or _inside(wrote)}".removesuffix(": ")
                 tail[0] += "; --force replaces" if renamed else ""
             elif self.text:
                 tail = [self.text]
@@ -104,45 +109,57 @@ class Done:
         if flags:
             counts = ", ".join(f"{f.value:,} {f.name.removeprefix(FLAG)}" for f in flags)
             lines.append(f"readings in doubt  {counts}")
-        notes = [line for name, each in report.metadata.items() for line in _notes(name, each)]
-        lines += _cut([*self.lines, *notes], min(room - len(lines), MOST_NOTES + 1), self.rest)
-        return lines
+        lists = (dict, list, tuple)
+        notes = [line for name, each in report.metadata.items() for line in _notes(name, each, brief=True)]
+        facts = [each for each in report.metadata.values() if not isinstance(each, lists) and each != ""]
+        left = len(report.figures) - len(flags) - min(len(chosen), MOST_FIGURES) + len(facts)
+        room = min(room - len(lines), MOST_NOTES + 2)
+        return lines + _cut([*self.lines, *notes], room, self.rest, left if self.rest else 0)
 
 
-def _cut(lines: Sequence[str], most: int, rest: str) -> list[str]:
-    """At most so many lines, the last of which tells how many are left out, and where they are."""
-    if len(lines) <= most:
+def _cut(lines: Sequence[str], most: int, rest: str, left: int = 0) -> list[str]:
+    """At most so many lines, the last of which tells how many more there are, beside `left`, and where."""
+    if len(lines) + bool(left) <= most and not left:
         return list(lines)
-    shown = max(most - 1, 0)
-    return [*lines[:shown], f"  and {len(lines) - shown:,} more: {rest or 'add --json'}"]
+    shown = max(min(most - 1, len(lines)), 0)
+    return [
+        *lines[:shown],
+        f"and {len(lines) - shown + left:,} more {'facts' if left else 'lines'}: {rest or 'add --json'}",
+    ]
+
+
+def _inside(wrote: Sequence[str]) -> str:
+    """What is in the only folder that was written; "" for files."""
+    folder = Path(wrote[0])
+    return (
+        listed(sorted(file.name for file in folder.iterdir())) if wrote[1:] == [] and folder.is_dir() else ""
+    )
 
 
 def _bold(text: str) -> str:
     """A title or verdict, whose lines are broken between words on a terminal."""
-    width = _width()
-    return printable(text) if width is None else textwrap.fill(printable(text), width)
+    columns = width()
+    return printable(text) if columns is None else textwrap.fill(printable(text), columns)
 
 
-def _width() -> int | None:
+def width() -> int | None:
     """Columns of the terminal; None for output that goes elsewhere."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() or os.environ.get("COLUMNS") else None
 
 
 def _rows(figures: Sequence[Any], *, clip: bool = False) -> list[str]:
     """Figures as lines of name, value, unit and note; a terminal's notes are clipped to its width."""
-    rows, width = [], _width()
+    numbers, words, columns = list[tuple[str, ...]](), list[tuple[str, ...]](), width()
     for figure in figures:
-        value, spread = figure.value, ""
-        if not isinstance(value, str):
-            value = f"{value:,.6g}" if isinstance(value, float) else f"{value:,}"
-            spread = f"± {_rounded(figure.spread)} " if figure.spread is not None else ""
-        rows.append((figure.name, value, f"{spread}{figure.unit}", figure.note))
-    numeric = [not isinstance(figure.value, str) for figure in figures]
-    lines = [
-        *aligned([row for row, number in zip(rows, numeric, strict=True) if number], right=(1,)),
-        *aligned([row for row, number in zip(rows, numeric, strict=True) if not number]),
-    ]
-    return [clipped(line, width) if clip and width else line for line in lines]
+        value = figure.value
+        if isinstance(value, str):
+            words.append((figure.name, f"{value} {figure.unit}".rstrip(), figure.note))
+            continue
+        spread = f"± {_rounded(figure.spread)} " if figure.spread is not None else ""
+        shown = f"{value:,.6g}" if isinstance(value, float) else f"{value:,}"
+        numbers.append((figure.name, shown, f"{spread}{figure.unit}", figure.note))
+    lines = [*aligned(numbers, right=(1,)), *aligned(words)]
+    return [clipped(line, columns) if clip and columns else line for line in lines]
 
 
 def _facts(metadata: dict[str, Any]) -> list[str]:
@@ -152,12 +169,26 @@ def _facts(metadata: dict[str, Any]) -> list[str]:
     return [*aligned([row for row in words if row[1]]), *lists]
 
 
-def _notes(name: str, entry: Any) -> list[str]:
+def _notes(name: str, entry: Any, *, brief: bool = False) -> list[str]:
     """A list or table of metadata: its name, and a line for each entry."""
-    if not isinstance(entry, dict | list | tuple):
+    if not isinstance(entry, dict | list | tuple) or (brief and name in ORIGIN):
         return []
     pairs = entry.items() if isinstance(entry, dict) else (("-", item) for item in entry)
     return [name, *(f"  {printable(str(key))}  {printable(str(item))}" for key, item in pairs)]
+
+
+def refusal(text: str) -> dict[str, str]:
+    """A refusal for JSON: its text, and the file, the parameter and the way on that it names."""
+    file, colon, _ = text.partition(": ")
+    looks = os.path.lexists(file) or (" " not in file and ("/" in file or "." in file))
+    parameter = re.search(r"--[a-z][a-z0-9-]*", text)
+    found = {
+        "message": text,
+        "file": file if colon and looks else "",
+        "parameter": parameter[0] if parameter else "",
+        "hint": text.rpartition("; ")[2] if "; " in text else "",
+    }
+    return {name: each for name, each in found.items() if each}
 
 
 def print_json(data: Any) -> None:
@@ -223,6 +254,14 @@ def continued_by_a_repeat(*, when: bool = True) -> Iterator[None]:
         raise
 
 
+def stdout_console() -> Any:
+    """A console for help that goes to a file or another program: no line is broken."""
+    from rich.console import Console
+
+    columns = None if os.environ.get("COLUMNS") else WIDE
+    return Console(highlight=False, width=columns, file=cast(TextIO, _Trimmed()))
+
+
 class _Trimmed(io.TextIOBase):
     """Stdout without the spaces that rich fills up lines with."""
 
@@ -233,46 +272,6 @@ class _Trimmed(io.TextIOBase):
     def flush(self) -> None:
         """Flush stdout."""
         sys.stdout.flush()
-
-
-def stdout_console() -> Any:
-    """A console on stdout: as wide as the terminal, or as its text if stdout is no terminal."""
-    from rich.console import Console as RichConsole
-
-    class Console(RichConsole):
-        def on_broken_pipe(self) -> None:
-            raise  # the program ends as after any other output
-
-    if _mode.json or _mode.quiet:
-        console = Console(file=io.StringIO(), highlight=False)
-    elif sys.stdout.isatty():
-        console = Console(highlight=False)
-    else:
-        width = None if os.environ.get("COLUMNS") else WIDE
-        console = Console(highlight=False, width=width, file=cast(TextIO, _Trimmed()))
-    console.push_render_hook(cast(Any, _PrintableTexts()))
-    return console
-
-
-class _PrintableTexts:
-    """Hook of a console: escapes control characters in all that is printed, but for those of styles."""
-
-    def process_renderables(self, renderables: list[Any]) -> list[Any]:
-        """What a console is to print, escaped."""
-        return [_Escaped(renderable) for renderable in renderables]
-
-
-@dataclass(frozen=True)
-class _Escaped:
-    """Something to print, with control characters of its texts escaped."""
-
-    content: Any
-
-    def __rich_console__(self, console: Any, options: Any) -> Iterator[Any]:
-        from rich.segment import Segment
-
-        for text, style, control in console.render(self.content, options):
-            yield Segment(text if control else printable_lines(text), style, control)
 
 
 def check_suffix(path: Path, suffixes: tuple[str, ...], what: str) -> None:

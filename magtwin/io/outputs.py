@@ -81,6 +81,7 @@ def drive(
     scans: bool = False,
     metadata: Mapping[str, str | int] = MappingProxyType({}),
     report: Callable[[str], Any] = lambda text: None,
+    tell: Callable[[str], Any] = lambda text: None,
     **options: Any,
 ) -> Driven:
     """Drive a scene's robot along a path, by commands, or as in a recorded run.
@@ -95,6 +96,7 @@ def drive(
         scans: Whether the LiDAR's rays are cast.
         metadata: Metadata of the run, such as names of files that move with it.
         report: Called with a line about each step.
+        tell: Called with a line about what is driven otherwise than it was asked for.
         options: Of `magtwin.open_twin` and `magtwin.simulate`.
 
     Raises:
@@ -107,9 +109,9 @@ def drive(
     planned = what if isinstance(what, Planned) else None
     if planned is not None and planned.placing:
         how = _placing(planned.placing, named=path in (*PATHS, *CASES))
-        report(f"Path {planned.name} is {how} to fit this floor and what stands on it")
+        tell(f"Path {planned.name} is {how} to fit this floor and what stands on it")
     if isinstance(what, Commands) and (text := what.beyond(twin.scene.robot.drive)):
-        report(text)
+        tell(text)
     report(f"Driving {getattr(what, 'name', 'random' if what == 'random' else 'as recorded')}")
     run = simulate(twin, what, seed=seed, **options).with_metadata(**metadata)
     if scans:
