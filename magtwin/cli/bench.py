@@ -1,5 +1,6 @@
 """`magtwin bench`, its report, and comparisons."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -88,7 +89,7 @@ def bench(
         )
     report = made.report(standings(made.rows, made.times, made.compensated))
     page = ("magtwin", "bench", "report", out)
-    return Done(report, out, rest=str(out), next=(page,))
+    return Done(report, out, rest=shlex.join(map(str, page)), next=(page,))
 
 
 @bench_app.command

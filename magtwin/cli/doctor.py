@@ -1,6 +1,5 @@
 """`magtwin doctor`: what is installed, and what each missing extra would add; and `magtwin completion`."""
 
-import shutil
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -54,11 +53,10 @@ def diagnose() -> dict[str, Any]:
     """Versions, tools and extras of this installation, as a table for JSON."""
     from ctypes.util import find_library
 
-    beside = shutil.which("rerun", path=Path(sys.executable).parent)
     drivers = [file.stem for folder in DRIVERS for file in sorted(Path(folder).glob("*.json"))]
     vulkan = ", ".join(drivers) if find_library("vulkan") else ""
     tools = (
-        ("Rerun viewer", shutil.which("rerun") or beside, "pip install rerun-sdk"),
+        ("Rerun viewer", find_spec("rerun_cli") and "installed", "pip install rerun-sdk"),
         ("Vulkan", vulkan, "apt install mesa-vulkan-drivers libvulkan1; pictures of recordings need it"),
         ("Newton", _version("newton"), "pip install 'magtwin[physics]'"),
         ("ROS 2, rclpy", find_spec("rclpy") and "installed", "source a ROS 2 installation"),

@@ -27,7 +27,7 @@ WIDE = 100_000
 MOST_LINES, MOST_FIGURES, MOST_NOTES = 12, 5, 5
 """Most lines, figures and notes that a command prints; `magtwin info`, pages and --json have all."""
 
-ORIGIN = ("source", "sources", "licences", "columns")
+ORIGIN = ("source", "sources", "licences", "columns", "features", "inputs")
 """Lists of a report that only `magtwin info` prints."""
 
 FLAG = "flag_"

@@ -91,12 +91,18 @@ def free(*paths: Path, beside: Iterable[str] = (), force: bool = False) -> list[
             raise InputError(f"{path if str(path).strip() else repr(str(path))}: {wrong}")
     names, endings = _names.get() or _Names(), tuple(beside)
     for number in count():
-        found = [path.with_name(f"{path.stem}-{number}{path.suffix}") if number else path for path in paths]
+        found = [_numbered(path, number) for path in paths]
         others = (path.with_name(f"{path.stem}{ending}") for path in found for ending in endings)
         if not any(map(os.path.lexists, (*found, *others))) and all(map(names.claim, found)):
             names.instead.update(zip(paths, found, strict=True) if number else ())
             return found
     raise AssertionError
+
+
+def _numbered(path: Path, number: int) -> Path:
+    """NAME-1.txt for NAME.txt; NAME_1.py, as a module's name has no hyphen."""
+    mark = "_" if path.suffix.lower() == ".py" else "-"
+    return path.with_name(f"{path.stem}{mark}{number}{path.suffix}") if number else path
 
 
 def instead() -> dict[Path, Path]:

@@ -148,7 +148,8 @@ def map_fit(
 
 def _done(report: Report, out: Path) -> Done:
     """A report on a survey or its map, and what to do with it."""
-    rest, look = f"magtwin info {out}", [("magtwin", "plot", out)]
+    rest = f"magtwin info {out}"
+    look: list[tuple[object, ...]] = [("magtwin", "plot", out)]
     if out.suffix.lower() == ".parquet":
         rest, look = "", [("magtwin", "map", "fit", out, "--out", out.with_suffix(".usdc"))]
     return Done(report, out, rest=rest, next=look)

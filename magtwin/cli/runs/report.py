@@ -97,7 +97,7 @@ def _lines(comparison: "Comparison", names: tuple[str, str]) -> list[str]:
     """The agreements as lines of a table."""
     shift = f"moved by {comparison.shift:+.4f} {comparison.unit}"
     how = "clocks as recorded" if comparison.align == "none" else shift
-    rows = [("", "unit", "mean", "RMS", "mean abs.", "greatest", "correlation")]
+    rows: list[tuple[str, ...]] = [("", "unit", "mean", "RMS", "mean abs.", "greatest", "correlation")]
     for row in comparison.agreements():
         correlation = "" if row.correlation is None else f"{row.correlation:.4f}"
         numbers = (f"{value:,.4g}" for value in (row.mean, row.rms, row.mae, row.greatest))

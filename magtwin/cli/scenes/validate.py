@@ -67,8 +67,9 @@ def validate(
     if skipped:
         print_error(f"asked for and not run: {skipped[0].validator}: {skipped[0].not_run}")
     failed = bool(skipped) or not all(findings.clean for findings in found)
-    lines = [line for findings in found for line in _lines_of(findings)]
-    return Done(lines=lines, wrote=out or (), data=tables, rest=str(out or "--json"), status=int(failed))
+    told = [_lines_of(findings) for findings in found]
+    lines = [*(verdict for verdict, *_ in told), *(line for _, *lines in told for line in lines)]
+    return Done(lines=lines, wrote=out or (), data=tables, rest=str(out or ""), status=int(failed))
 
 
 def _lines_of(findings: "Findings") -> list[str]:
