@@ -11,6 +11,7 @@ from urllib.parse import urlsplit
 
 from magtwin.errors import InputError, find
 from magtwin.export.validation.isaac_sim import FILES, copy_folder
+from magtwin.files.file import sha256
 from magtwin.files.outputs import output
 
 UNSTATED = "NOASSERTION"
@@ -94,6 +95,12 @@ magnetic SLAM."""
 def default_folder(name: str) -> Path:
     """Folder of a source if none is given: its name, or for Isaac Sim's rules where `validate` finds them."""
     return copy_folder() if name == "isaac-rules" else Path(name)
+
+
+def is_complete(name: str, folder: Path) -> bool:
+    """Whether a folder has all files of a source, with the pinned checksums."""
+    files = [each for source in find("source", name, SOURCES) for each in source.files()]
+    return all((folder / file).is_file() and sha256(folder / file) == checksum for file, checksum, _ in files)
 
 
 def fetch(

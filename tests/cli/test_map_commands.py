@@ -122,9 +122,6 @@ def test_diff_tells_and_draws_what_changed(tmp_path, layer, capsys):
     )
     words = "".join(ElementTree.parse(tmp_path / "d.svg").getroot().itertext())
     assert "hall 2026-01-01 to hall 2026-02-01" in words
-    assert "exists already" in refused(
-        capsys, "map", "diff", layer, tmp_path / "b.usdc", "--out", tmp_path / "d.svg"
-    )
 
 
 def test_a_picture_of_another_kind_is_refused_before_anything_is_read(tmp_path, capsys):

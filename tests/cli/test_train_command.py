@@ -245,7 +245,8 @@ def test_what_cannot_be_trained_is_refused_and_writes_nothing(data, kinds, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
-def test_files_beside_the_weights_are_not_written_over(data, tmp_path, refusal):
+def test_files_beside_the_weights_are_not_written_over(data, tmp_path, tiny, capsys):
     (tmp_path / "f.png").write_text("mine")
-    said = refusal("train", data, "--out", tmp_path / "f.safetensors")
-    assert "f.png: exists already; give --force" in said
+    main(["train", str(data), *tiny, "--out", str(tmp_path / "f.safetensors")])
+    assert f"exists: wrote {tmp_path / 'f-1.safetensors'}" in capsys.readouterr().out
+    assert sorted(p.name for p in tmp_path.glob("f*")) == ["f-1.md", "f-1.png", "f-1.safetensors", "f.png"]

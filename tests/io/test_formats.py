@@ -170,7 +170,6 @@ def test_convert_takes_frames_a_second_units_and_the_scene(run, written, lab_sce
 @pytest.mark.parametrize(
     ("source", "out", "options", "message"),
     [
-        ("run.parquet", "run.csv", [], "run.csv: exists already; give --force"),
         ("run.parquet", "new.xyz", [], "unknown format of a run; known: .csv"),
         ("run.parquet", "new.csv", ["--out-unit", "nT"], "CSV has no option 'units'; drop it"),
         ("run.parquet", "new.csv", ["--scene", "x.usda"], "a table shows no scene; drop --scene"),

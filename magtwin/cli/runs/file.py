@@ -112,12 +112,15 @@ def fetch(
     base_url
         Address of a mirror with the same paths.
     """
-    from magtwin.fetch import default_folder
+    from magtwin.fetch import default_folder, is_complete
     from magtwin.fetch import fetch as fetch_files
     from magtwin.files.outputs import free
 
-    folder = free(Path(assets), force=force)[0] if out is None and assets != "isaac-rules" else out
-    folder = folder or default_folder(assets)
+    folder = out or default_folder(assets)
+    if not force and is_complete(assets, folder):
+        return Done(text=f"{folder}: all files are there already, as published", data={"wrote": []})
+    if out is not None or assets != "isaac-rules":  # these are looked for in one place
+        (folder,) = free(folder, force=force)
     with progress(f"Fetching {assets}", "files") as advance:
         files = fetch_files(assets, folder, base_url=base_url, force=force, progress=advance)
     return Done(wrote=folder, text=f"{len(files)} files")
