@@ -256,7 +256,11 @@ def continued_by_a_repeat(*, when: bool = True) -> Iterator[None]:
 
 def stdout_console() -> Any:
     """A console for help that goes to a file or another program: no line is broken."""
-    from rich.console import Console
+    from rich.console import Console as RichConsole
+
+    class Console(RichConsole):
+        def on_broken_pipe(self) -> None:
+            raise  # the program ends as after any other output
 
     columns = None if os.environ.get("COLUMNS") else WIDE
     return Console(highlight=False, width=columns, file=cast(TextIO, _Trimmed()))
