@@ -139,15 +139,15 @@ def localize_live(
     settings
         Settings, such as prior:=global use_sim_time:=true.
     method
-        As for `magtwin localize`.
+        Name of a method, or MODULE:CLASS, as for `magtwin localize`.
     option
         Options of the method, as NAME=VALUE.
     map
         Map to use instead of the scene's, as for `magtwin localize`. none: no map.
     sensor
-        As for `magtwin localize`.
+        Values of the magnetometer's noise model, as for `magtwin localize`.
     odometry
-        As for `magtwin localize`.
+        Values of the odometry's noise model, as for `magtwin localize`.
     map_length_m
         Correlation length of the map's error that the method is told [m].
     """

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from magtwin.errors import InputError
 from magtwin.files.file import existing
-from magtwin.files.kinds import SCENE_FOLDER, SURVEY, USD_SUFFIXES, kind_of, scene_file, shipped_or
+from magtwin.files.kinds import SURVEY, USD_SUFFIXES, kind_of, shipped_or
 
 Show = Literal["charts", "picture", "field", "gradient", "variance", "mask", "headings"]
 
@@ -62,7 +62,7 @@ def draw(
     suffix = out.suffix.lower()
     if not any(suffix in known for known in SUFFIXES.values()):
         raise InputError(f"{out}: a picture ends in .png, .svg or .jpg, and a film in .mp4 or .gif")
-    paths = [existing(_inside(shipped_or(file)), "run, stage, map or recording") for file in files]
+    paths = [existing(shipped_or(file), "run, stage, map or recording") for file in files]
     way = _way(paths, suffix, show, given)
     kind, what, takes = WAYS[way]
     if suffix not in SUFFIXES[kind]:
@@ -83,11 +83,6 @@ def draw(
         with Image.open(picture) as image:
             image.convert("RGB").save(aside, "JPEG", quality=92)
     return out, messages
-
-
-def _inside(file: Path) -> Path:
-    """The stage in the folder of a scene; another path as it is."""
-    return scene_file(file) if file.is_dir() and kind_of(file) is SCENE_FOLDER else file
 
 
 def _way(paths: Sequence[Path], suffix: str, show: Show | None, given: dict[str, Any]) -> str:

@@ -1,5 +1,8 @@
 """`magtwin new` and `magtwin scene`."""
 
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -115,7 +118,8 @@ def scene(
             else:
                 _check_unused(magnetometer=magnetometer, controllers=controllers, package=package, arg=arg)
                 step(f"Reading {spec}")
-                read = scene_from_toml(spec, **choices)
+                with _keys_for_flags():
+                    read = scene_from_toml(spec, **choices)
         step("Authoring the stage")
         root = author_scene(read, out, force=force)
         made = [s.robot for s in read.robots if s.robot.asset.is_relative_to(Path(workshop).resolve())]
@@ -126,8 +130,23 @@ def scene(
     return Done(report, root, FIGURES, lines, rest=f"magtwin info {root}", next=following)
 
 
+@contextmanager
+def _keys_for_flags() -> Iterator[None]:
+    """Names the keys of a TOML where a refusal of its URDF names flags of `magtwin robot`."""
+    try:
+        yield
+    except InputError as error:
+        packages = r'packages = {\1 = "FOLDER"} below [robot.conversion]'
+        told = re.sub(r"--package (\S+)=FOLDER", packages, str(error))
+        raise InputError(
+            re.sub("`skip_missing_includes[^`]*`", "skip_missing_includes = true", told)
+        ) from error
+
+
 def _check_unused(**options: object) -> None:
     """Refuse options that only matter with --urdf."""
     used = [f"--{name}" for name, value in options.items() if value is not None]
     if used:
-        raise InputError(f"{', '.join(used)} goes with --urdf; a TOML names these in [robot]")
+        raise InputError(
+            f"{', '.join(used)} goes with --urdf; a TOML has keys for these below [robot.conversion]"
+        )
