@@ -57,12 +57,16 @@ _running: list[App] = []
 _typed: list[str] = []
 """The arguments."""
 
+_read: list[Path] = []
+"""The files that the command may read."""
+
 
 def main(arguments: list[str], *, tell: Callable[[], str] | None = None) -> None:
     """Run the `magtwin` command, or print the text that `tell` gives in place of it."""
     debug = "--debug" in arguments
     _end_by_exceptions()
     _running.clear()
+    _read.clear()
     _typed[:] = arguments
     try:
         arguments, folders = _allowed([a for a in arguments if a != "--debug"])
@@ -92,7 +96,7 @@ def main(arguments: list[str], *, tell: Callable[[], str] | None = None) -> None
             raise
         if isinstance(error, InputError):
             _running[:] = _running or [app.parse_commands(arguments)[1][-1]]
-            _fail(error.in_flags(_flags()))
+            _fail(_named_as_typed(error.in_flags(_flags())))
         if text := _wrong_name(error, arguments):
             _fail(text)
         if isinstance(error, MemoryError) or _TOO_LITTLE.search(str(error)):
@@ -204,8 +208,8 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
         from magtwin.files.outputs import reading
 
         _running[:] = [command]
-        given = signature.bind_partial(*args, **options).arguments
-        with output_mode(as_json=json, quiet=quiet), reading(_files(given)):
+        _read[:] = _files(signature.bind_partial(*args, **options).arguments)
+        with output_mode(as_json=json, quiet=quiet), reading(_read):
             done = function(*args, **options)
             if isinstance(done, Done):
                 done.show()

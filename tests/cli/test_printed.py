@@ -4,6 +4,7 @@ import hashlib
 import json
 import re
 import shlex
+import tempfile
 from contextlib import suppress
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from faults.commands import COMMANDS, make_inputs
 
 from magtwin.cli import main
 from magtwin.cli.terminal import MOST_LINES, refusal
+from magtwin.errors import InputError
 
 ROOT = Path(__file__).parents[2]
 
@@ -134,3 +136,17 @@ def test_a_text_before_a_colon_is_a_file_only_if_it_looks_like_one():
     assert refusal("room.toml [lab]: no; do") == {"message": "room.toml [lab]: no; do", "hint": "do"}
     assert refusal("a/b: no")["file"] == "a/b"
     assert "file" not in refusal("seed: no")
+
+
+def test_a_refusal_names_the_file_that_was_typed_and_not_its_copy(tmp_path, monkeypatch, capsys):
+    import magtwin.io.info
+
+    def refuse(file, **_):
+        with tempfile.TemporaryDirectory() as folder:
+            raise InputError(f"{folder}/part/x.mcap: damaged; not {tmp_path}")
+
+    monkeypatch.setattr(magtwin.io.info, "info_of", refuse)
+    (tmp_path / "bag.mcap").touch()
+    with pytest.raises(SystemExit):
+        main(["info", str(tmp_path / "bag.mcap")])
+    assert capsys.readouterr().err == f"magtwin: {tmp_path / 'bag.mcap'}: damaged; not {tmp_path}\n"
