@@ -119,6 +119,16 @@ def refuse_command(arguments: list[str]) -> str:
     _fail(unknown_command(arguments[0], more=arguments[1:2]), status=2)
 
 
+def _named_as_typed(text: str) -> str:
+    """A refusal that names the user's file in place of what was made of it in a temporary folder."""
+    import tempfile
+
+    for match in re.finditer(rf"({re.escape(tempfile.gettempdir())}/tmp\w{{8}})/[^\s:,;]*", text):
+        if _read and not any(file.absolute().is_relative_to(match[1]) for file in _read):
+            text = text.replace(match[0], str(_read[0]))
+    return text
+
+
 def _end_by_exceptions() -> None:
     """Turn signals that end the process into exceptions, so that partial outputs are removed."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
