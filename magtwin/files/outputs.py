@@ -21,11 +21,15 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from itertools import count
 from pathlib import Path
 from zlib import crc32
 
 from magtwin.errors import InputError
+
+try:
+    import fcntl
+except ImportError:  # Windows: names are not kept from other commands
+    fcntl = None  # type: ignore[assignment]
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors of a disk that is full or read-only."""
@@ -58,9 +62,7 @@ def check_free(path: str | os.PathLike[str], *, force: bool = False, in_place: b
         InputError: It exists and `force` is False, or it is an input of the command and not `in_place`. Or it
             cannot be replaced, or be the name of an output.
     """
-    path = Path(path)
-    if wrong := _wrong(path):
-        raise InputError(f"{path if str(path).strip() else repr(str(path))}: {wrong}")
+    path = _named(Path(path))
     if os.path.lexists(path) and not force:
         link = " as a link" if path.is_symlink() else ""
         text = f"{path}: exists already{link}; give `force=True` to replace it, or another name"
@@ -74,7 +76,7 @@ def free(*paths: Path, beside: Iterable[str] = (), force: bool = False) -> list[
     """Names for a command's outputs that nothing has yet: NAME, else NAME-1, NAME-2, ..., all of one number.
 
     Until the command ends, no other command is given the same names: a hidden file beside each of them is
-    created and locked. A killed command leaves that file, which the next one takes over and removes.
+    locked. A killed command leaves that file, which the next one takes over and removes.
 
     Args:
         paths: The names asked for. Their folders are created; those that remain empty are removed.
@@ -86,23 +88,15 @@ def free(*paths: Path, beside: Iterable[str] = (), force: bool = False) -> list[
     """
     if force:
         return [check_free(path, force=True) for path in paths]
-    for path in paths:
-        if wrong := _wrong(path):
-            raise InputError(f"{path if str(path).strip() else repr(str(path))}: {wrong}")
-    names, endings = _names.get() or _Names(), tuple(beside)
-    for number in count():
-        found = [_numbered(path, number) for path in paths]
+    names, endings, number = _names.get(), tuple(beside), 0
+    while True:
+        found = [_numbered(_named(path), number) for path in paths]
         others = (path.with_name(f"{path.stem}{ending}") for path in found for ending in endings)
-        if not any(map(os.path.lexists, (*found, *others))) and all(map(names.claim, found)):
-            names.instead.update(zip(paths, found, strict=True) if number else ())
+        taken = any(map(os.path.lexists, (*found, *others)))
+        if not taken and (names is None or all(map(names.claim, found))):
+            instead().update(zip(paths, found, strict=True) if number else ())
             return found
-    raise AssertionError
-
-
-def _numbered(path: Path, number: int) -> Path:
-    """NAME-1.txt for NAME.txt; NAME_1.py, as a module's name has no hyphen."""
-    mark = "_" if path.suffix.lower() == ".py" else "-"
-    return path.with_name(f"{path.stem}{mark}{number}{path.suffix}") if number else path
+        number += 1
 
 
 def instead() -> dict[Path, Path]:
@@ -111,26 +105,28 @@ def instead() -> dict[Path, Path]:
     return {} if names is None else names.instead
 
 
+def _numbered(path: Path, number: int) -> Path:
+    """NAME-1.txt for NAME.txt; NAME_1.py, as a module's name has no hyphen."""
+    mark = "_" if path.suffix.lower() == ".py" else "-"
+    return path.with_name(f"{path.stem}{mark}{number}{path.suffix}") if number else path
+
+
 @dataclass
 class _Names:
     """Names that a command claimed, and what is undone at its end."""
 
-    end: ExitStack | None = None
+    end: ExitStack
     instead: dict[Path, Path] = field(default_factory=dict)
 
     def claim(self, path: Path) -> bool:
-        """Keep a name from other commands; False if one has it. Without `end`, or locks, nothing is kept."""
-        try:
-            import fcntl
-        except ImportError:
+        """Keep a name from other commands; False if one has it, or has just made the output."""
+        if fcntl is None:
             return True
-        if self.end is None:
-            return True
-        lock = path.with_name(f".{path.name[:60]}{HIDDEN}{crc32(os.fsencode(path.name)):08x}")
+        lock = path.with_name(f".{path.name[:60]}{HIDDEN}{crc32(os.fsencode(path.name)):08x}").absolute()
         try:
-            for folder in reversed([folder for folder in path.parents if not folder.exists()]):
+            for folder in reversed([folder for folder in lock.parents if not folder.exists()]):
                 folder.mkdir(exist_ok=True)
-                self.end.callback(_remove_empty, folder.absolute())
+                self.end.callback(_remove_empty, folder)
             number = os.open(lock, os.O_RDWR | os.O_CREAT, 0o600)
         except OSError as error:
             reason = f"cannot be written ({error.strerror})"
@@ -141,21 +137,26 @@ class _Names:
         except BlockingIOError:
             os.close(number)
             return False
-        except FileNotFoundError:
-            mine = False
-        except OSError:
-            mine = True  # a file system without locks
+        except OSError:  # a file system without locks, or the file has gone
+            mine = lock.exists()
         if not mine:  # the command that had it ended in this moment, and removed the file
             os.close(number)
             return self.claim(path)
         self.end.callback(os.close, number)
-        self.end.callback(lock.absolute().unlink, missing_ok=True)
+        self.end.callback(lock.unlink, missing_ok=True)
         return not os.path.lexists(path)
 
 
 def _remove_empty(folder: Path) -> None:
     with suppress(OSError):
         folder.rmdir()
+
+
+def _named(path: Path) -> Path:
+    """A path that can be the name of an output; raises InputError if it cannot."""
+    if wrong := _wrong(path):
+        raise InputError(f"{path if str(path).strip() else repr(str(path))}: {wrong}")
+    return path
 
 
 def _wrong(path: Path) -> str:
@@ -176,7 +177,7 @@ def _wrong(path: Path) -> str:
     above = next(folder for folder in path.parents if folder.exists())
     if not above.is_dir():
         return f"cannot be written, as {above} is no folder; give another name"
-    may = path.is_symlink() or os.access(above, os.W_OK | os.X_OK)  # in_place, a link leads elsewhere
+    may = path.is_symlink() or os.access(above, os.W_OK | os.X_OK)  # in place, a link leads elsewhere
     return "" if may else f"cannot be written, as {above.absolute()} is read-only; give a name elsewhere"
 
 
