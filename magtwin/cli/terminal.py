@@ -17,7 +17,7 @@ from typing import Any, TextIO, cast
 from magtwin.cli.progress import announce, current, progress, silence, step
 from magtwin.errors import InputError
 from magtwin.report.report import jsonable
-from magtwin.report.summary import aligned, clipped, listed, printable, printable_lines
+from magtwin.report.summary import WIDTH, aligned, clipped, listed, printable, printable_lines
 
 __all__ = ["announce", "printable", "progress", "silence", "step"]  # commands import these from here too
 
@@ -27,11 +27,13 @@ WIDE = 100_000
 MOST_LINES, MOST_FIGURES, MOST_NOTES = 12, 5, 5
 """Most lines, figures and notes that a command prints; `magtwin info`, pages and --json have all."""
 
-ORIGIN = ("source", "sources", "licences", "columns", "features", "inputs")
-"""Lists of a report that only `magtwin info` prints."""
+ORIGIN = ("licences", "columns", "features", "inputs")
+"""Lists of a report that only `magtwin info` prints, as it does those of checksums."""
 
 FLAG = "flag_"
-"""Figures of this beginning count readings in doubt, and are printed in one line."""
+"""Figures with this in their names count readings in doubt, and are printed in one line."""
+
+CHECKSUM = re.compile(r"[0-9a-f]{32}")
 
 
 @dataclass(frozen=True)
@@ -67,21 +69,18 @@ class Done:
         following = [shlex.join(map(str, words)) for words in self.next]
         written = [folder for path in wrote for folder in (Path(path), *Path(path).parents)]
         renamed = [str(asked) for asked, new in instead().items() if new in written]
-        other = f"{' and '.join(renamed)} exist{'s' if len(renamed) == 1 else ''}"
-        if _mode.json or _mode.quiet:
-            if renamed:
-                print_error(f"{other}: wrote {', '.join(wrote)}")
-        else:
-            tail = []
-            if wrote:
-                tail = [f"{other}: wrote {', '.join(wrote)}" if renamed else f"Wrote {', '.join(wrote)}"]
-                tail[0] += f": {self.text or _inside(wrote)}".removesuffix(": ")
-                tail[0] += "; --force replaces" if renamed else ""
-            elif self.text:
-                tail = [self.text]
+        said = (
+            f"{' and '.join(renamed)} exist{'s' if len(renamed) == 1 else ''}: wrote" if renamed else "Wrote"
+        )
+        said = f"{said} {listed(wrote, WIDTH)}" if wrote else ""
+        if not (_mode.json or _mode.quiet):
+            told = ": ".join(filter(None, (said, self.text or _inside(wrote))))
+            tail = [f"{told}; --force replaces" if renamed else told] if told else []
             tail += [f"{'       ' if k else 'Next:  '}{words}" for k, words in enumerate(following)]
             for line in (*self._told(MOST_LINES - len(tail)), *tail):
                 say(line)
+        elif renamed:
+            print_error(said)
         if _mode.json:
             data = self.data
             if data is None:
@@ -98,7 +97,7 @@ class Done:
         if self.report is None:
             return _cut(self.lines, room, self.rest)
         report, named = self.report, {figure.name: figure for figure in self.report.figures}
-        flags = [figure for figure in report.figures if figure.name.startswith(FLAG)]
+        flags = [figure for figure in report.figures if FLAG in figure.name]
         lines = [_bold(report.title), *([_bold(report.verdict)] if report.verdict else [])]
         if self.whole:
             return [*lines, *_rows(report.figures), *_facts(report.metadata)]
@@ -107,7 +106,7 @@ class Done:
             chosen = [figure for figure in report.figures if figure not in flags]
         lines += _rows(chosen[:MOST_FIGURES], clip=True)
         if flags:
-            counts = ", ".join(f"{f.value:,} {f.name.removeprefix(FLAG)}" for f in flags)
+            counts = ", ".join(f"{f.value:,} {f.name.replace(FLAG, '')}" for f in flags)
             lines.append(f"readings in doubt  {counts}")
         lists = (dict, list, tuple)
         notes = [line for name, each in report.metadata.items() for line in _notes(name, each, brief=True)]
@@ -130,10 +129,9 @@ def _cut(lines: Sequence[str], most: int, rest: str, left: int = 0) -> list[str]
 
 def _inside(wrote: Sequence[str]) -> str:
     """What is in the only folder that was written; "" for files."""
-    folder = Path(wrote[0])
-    return (
-        listed(sorted(file.name for file in folder.iterdir())) if wrote[1:] == [] and folder.is_dir() else ""
-    )
+    if len(wrote) != 1 or not Path(wrote[0]).is_dir():
+        return ""
+    return listed(sorted(file.name for file in Path(wrote[0]).glob("[!.]*")))
 
 
 def _bold(text: str) -> str:
@@ -171,7 +169,9 @@ def _facts(metadata: dict[str, Any]) -> list[str]:
 
 def _notes(name: str, entry: Any, *, brief: bool = False) -> list[str]:
     """A list or table of metadata: its name, and a line for each entry."""
-    if not isinstance(entry, dict | list | tuple) or (brief and name in ORIGIN):
+    if not isinstance(entry, dict | list | tuple) or (
+        brief and (name in ORIGIN or CHECKSUM.search(str(entry)))
+    ):
         return []
     pairs = entry.items() if isinstance(entry, dict) else (("-", item) for item in entry)
     return [name, *(f"  {printable(str(key))}  {printable(str(item))}" for key, item in pairs)]
