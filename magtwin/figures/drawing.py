@@ -7,6 +7,7 @@ from typing import Any, Literal
 from magtwin.errors import InputError
 from magtwin.files.file import existing
 from magtwin.files.kinds import SURVEY, USD_SUFFIXES, kind_of, shipped_or
+from magtwin.files.outputs import check_free, output
 
 Show = Literal["charts", "picture", "field", "gradient", "variance", "mask", "headings"]
 
@@ -74,8 +75,6 @@ def draw(
     from tempfile import TemporaryDirectory
 
     from PIL import Image
-
-    from magtwin.files.outputs import output
 
     with TemporaryDirectory() as folder, output(out, force=force) as aside:
         picture = Path(folder) / "picture.png"
@@ -153,10 +152,19 @@ def _draw(
         save(_charts(paths[0], given.get("scene")), out, force=force)
     elif way == "film":
         views.film(paths[0], out, force=force, advance=advance, **given)
+    elif way == "recording":
+        from magtwin.io.rerun.viewer import screenshot
+
+        given["time_s"] = given.pop("at_s", None)
+        return screenshot(paths[0], check_free(out, force=force), force=force, **given)
+    elif way == "stage":
+        from magtwin.figures.pictures import picture_of_stage
+        from magtwin.figures.scenery import View
+
+        given |= {"camera": View.of(given["camera"]).camera()} if "camera" in given else {}
+        picture_of_stage(paths[0], out, force=force, **given)
     else:
-        camera = given.pop("camera", "orbit" if way == "moment" else None)
-        time_s = given.pop("at_s", None)
-        return views.picture(paths[0], out, force=force, camera=camera, time_s=time_s, **given)
+        views.picture(paths[0], out, time_s=given.pop("at_s", None), force=force, **given)
     return ()
 
 
