@@ -33,7 +33,7 @@ ORIGIN = ("licences", "columns", "features", "inputs")
 FLAG = "flag_"
 """Figures with this in their names count readings in doubt, and are printed in one line."""
 
-CHECKSUM = re.compile(r"[0-9a-f]{32}")
+CHECKSUM, LISTS = re.compile(r"[0-9a-f]{32}"), (dict, list, tuple)
 
 
 @dataclass(frozen=True)
@@ -108,9 +108,8 @@ class Done:
         if flags:
             counts = ", ".join(f"{f.value:,} {f.name.replace(FLAG, '')}" for f in flags)
             lines.append(f"readings in doubt  {counts}")
-        lists = (dict, list, tuple)
         notes = [line for name, each in report.metadata.items() for line in _notes(name, each, brief=True)]
-        facts = [each for each in report.metadata.values() if not isinstance(each, lists) and each != ""]
+        facts = [each for each in report.metadata.values() if not isinstance(each, LISTS) and each != ""]
         left = len(report.figures) - len(flags) - min(len(chosen), MOST_FIGURES) + len(facts)
         room = min(room - len(lines), MOST_NOTES + 2)
         return lines + _cut([*self.lines, *notes], room, self.rest, left if self.rest else 0)
@@ -162,16 +161,14 @@ def _rows(figures: Sequence[Any], *, clip: bool = False) -> list[str]:
 
 def _facts(metadata: dict[str, Any]) -> list[str]:
     """All metadata: words by name, and then lists."""
-    words = [(name, str(each)) for name, each in metadata.items() if not isinstance(each, dict | list)]
+    words = [(name, str(each)) for name, each in metadata.items() if not isinstance(each, LISTS)]
     lists = [line for name, each in metadata.items() for line in _notes(name, each)]
     return [*aligned([row for row in words if row[1]]), *lists]
 
 
 def _notes(name: str, entry: Any, *, brief: bool = False) -> list[str]:
     """A list or table of metadata: its name, and a line for each entry."""
-    if not isinstance(entry, dict | list | tuple) or (
-        brief and (name in ORIGIN or CHECKSUM.search(str(entry)))
-    ):
+    if not isinstance(entry, LISTS) or (brief and (name in ORIGIN or CHECKSUM.search(str(entry)))):
         return []
     pairs = entry.items() if isinstance(entry, dict) else (("-", item) for item in entry)
     return [name, *(f"  {printable(str(key))}  {printable(str(item))}" for key, item in pairs)]
