@@ -37,7 +37,7 @@ def map_file(source: Source) -> Path:
     """
     path = Path(source)
     if path.exists():
-        return shipped_or(source)
+        return shipped_or(path)
     if path.suffix or (len(path.parts) > 1 and not path.exists()):
         return existing(path, "map")
     try:
