@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path as FilePath
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -371,29 +372,23 @@ def test_metadata_in_the_viewer_are_text_and_no_markdown():
 
 def test_a_viewer_that_lives_is_waited_for_and_a_command_is_sent_once(monkeypatch):
     monkeypatch.setattr(viewer, "LATE_S", 0.05)
-    sent, alive = [], [None]
+    sent, ended = [], [None]
 
-    class Client:
-        def __getattr__(self, name):
-            def call(late=0.0):
-                sent.append(name)
-                if late and sent.count(name) < 3:
-                    time.sleep(late)
-                    raise RuntimeError("deadline has elapsed")
-                return name
+    def ask(name, late):
+        sent.append(name)
+        if late and sent.count(name) < 3:
+            time.sleep(late)
+            raise RuntimeError("deadline has elapsed")
+        return name
 
-            return call
-
-    class Process:
-        def poll(self):
-            return alive[0]
-
-    client = viewer._Patient(Client(), Process())
+    names = ("take_screenshot", "run_command", "get_state", "open", "save_screenshot")
+    slow = SimpleNamespace(**{name: lambda late=0.0, name=name: ask(name, late) for name in names})
+    client = viewer._Patient(slow, SimpleNamespace(poll=lambda: ended[0]))
     assert client.take_screenshot(0.06) == "take_screenshot"
     assert client.run_command(0.06) == "get_state"
     assert sent == ["take_screenshot"] * 3 + ["run_command", "get_state"]
     with pytest.raises(RuntimeError):
-        client.open(0.01)  # an error that came at once is none of time
-    alive[0] = 1
+        client.open(0.01)  # it came at once
+    ended[0] = 1
     with pytest.raises(RuntimeError):
         client.save_screenshot(0.06)
