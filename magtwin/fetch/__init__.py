@@ -4,6 +4,7 @@ magtwin ships none of them. Each source is a table: name, checksum, and path in 
 commit.
 """
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,7 +150,9 @@ def fetch(
             except ValueError as error:  # pooch: the checksum differs
                 raise InputError(f"{url}: its SHA-256 is not {checksum}; nothing was kept") from error
             except OSError as error:  # requests' exceptions are OSErrors
-                reason = str(error).split("\n")[0]
-                raise InputError(f"{url}: could not be fetched ({reason}); nothing was kept") from error
+                cause = re.search(r"\[Errno -?\d+\] ([^'\")]+)", str(error))
+                reason = cause[1] if cause else str(error).split("\n")[0]
+                text = f"{url}: could not be fetched ({reason}); nothing was kept; try again with a network"
+                raise InputError(f"{text}, or from a mirror with `base_url`") from error
         progress(len(jobs), len(jobs), "")
     return [dest / file for file, _, _ in jobs]
