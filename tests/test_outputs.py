@@ -10,7 +10,7 @@ import pytest
 
 from magtwin.errors import InputError
 from magtwin.files import outputs
-from magtwin.files.outputs import afterwards, check_free, not_read, output, reading, transaction
+from magtwin.files.outputs import afterwards, check_free, free, not_read, output, reading, transaction
 
 EVENTS = (
     (os, "fsync"),
@@ -262,3 +262,69 @@ def test_links_are_put_back_if_a_later_output_of_the_command_fails(tmp_path, mon
         write(tmp_path / "last", {"x.txt": "mine", "../../last/x.txt": "theirs"})
     assert content(tmp_path)["last/x.txt"] == "theirs", "the command did not fail"
     assert {name: (tmp_path / name).readlink() for name in links} == links
+
+
+def test_an_output_that_exists_gets_the_next_number_with_all_that_lies_beside_it(tmp_path):
+    for name in ("run", "a.md", "b-1.png", "b.rrd", "c.scans.parquet"):
+        (tmp_path / name).touch()
+    for asked, beside, found in (
+        (("run",), (), ("run-1",)),
+        (("a.safetensors",), (".md", ".png"), ("a-1.safetensors",)),
+        (("b.rrd", "b.png", "d"), (), ("b-2.rrd", "b-2.png", "d-2")),
+        (("c.parquet",), (".scans.parquet",), ("c-1.parquet",)),
+        (("new/e",), (), ("new/e",)),
+    ):
+        with reading([]):
+            names = free(*(tmp_path / name for name in asked), beside=beside)
+            assert names == [tmp_path / name for name in found]
+            told = zip(asked, found, strict=True)
+            assert outputs.instead() == {tmp_path / a: tmp_path / b for a, b in told if a != b}
+    assert free(tmp_path / "run", force=True) == [tmp_path / "run"]
+    assert not (tmp_path / "new").exists()  # nothing was written there
+    assert not [*tmp_path.glob(".*")]
+
+
+def test_commands_at_the_same_time_get_names_of_their_own_and_a_killed_one_leaves_none(tmp_path):
+    """Twelve processes ask at once; some are killed while they hold a name."""
+    gate, children = os.pipe(), []
+    for k in range(12):
+        children.append(os.fork())
+        if children[-1] == 0:
+            os.read(gate[0], 1)
+            with reading([]):
+                (name,) = free(tmp_path / "run")
+                if k % 4 == 0:
+                    os.kill(os.getpid(), signal.SIGKILL)
+                with output(name) as aside:
+                    aside.write_text(str(k))
+            os._exit(0)
+    os.write(gate[1], b"x" * len(children))
+    ends = [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
+    assert ends == [-signal.SIGKILL, 0, 0, 0] * 3
+    texts = [file.read_text() for file in tmp_path.iterdir() if not file.name.startswith(".")]
+    assert sorted(map(int, texts)) == [k for k in range(12) if k % 4]
+    for _ in range(3):  # later commands take over what the killed ones left
+        with reading([]):
+            free(tmp_path / "run")[0].touch()
+    with reading([]):
+        free(tmp_path / "run")
+    assert len([*tmp_path.glob("run*")]) == 12
+
+
+@pytest.mark.skipif(os.name != "posix" or os.getuid() != 0, reason="needs a second user")
+def test_a_folder_that_cannot_be_written_is_refused_at_once(tmp_path):
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    tmp_path.parent.chmod(0o755)
+    child = os.fork()
+    if child == 0:
+        os.chdir(folder)
+        os.setuid(65534)
+        said = ""
+        with suppress(BaseException), reading([]):
+            try:
+                free(Path("run"))
+            except InputError as error:
+                said = str(error)
+        os._exit(not ("run: cannot be written" in said and "read-only; give a name elsewhere" in said))
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

@@ -3,11 +3,13 @@
 import dataclasses
 import os
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from magtwin.errors import InputError
 from magtwin.files.kinds import expected
 from magtwin.files.outputs import output
 from magtwin.urdf.convert import convert_with_report
@@ -57,7 +59,8 @@ def from_urdf(
 
     Args:
         urdf: The description.
-        out: Folder to create, with `<name>.usda` and the layers that it references.
+        out: Folder to create, with `<name>.usda` and the layers that it references; or one file .usda, with
+            its meshes beside it.
         settings: Values that a URDF lacks (drive, battery, platform field, sensor mounts), as RobotSettings
             or a TOML file of their fields. `None` converts the articulation only.
         force: Whether to replace an existing folder.
@@ -73,21 +76,24 @@ def from_urdf(
     """
     urdf = expected(urdf, "robot description")
     name = f"{urdf.name.lstrip('.').split('.')[0] or 'robot'}.usda"
-    asset = Path(out) / name
-    if settings is None:
-        options = dataclasses.replace(DEFAULTS, **choices)
-        with output(out, force=force) as folder:
+    one_file = Path(out).suffix.lower() == ".usda"
+    if one_file and not choices.setdefault("single_file", True):
+        raise InputError(f"{out}: one file; give a folder for `single_file=False`", parameter="out")
+    asset = Path(out) if one_file else Path(out) / name
+    equipped = given = None
+    if settings is not None:
+        equipped = import_module(LATER["RobotSettings"])
+        given = settings if isinstance(settings, equipped.RobotSettings) else equipped.read_settings(settings)
+    options = dataclasses.replace(DEFAULTS if given is None else given.conversion, **choices)
+    with nullcontext() if one_file else output(out, force=force) as folder:
+        if folder is not None:
             folder.mkdir()
-            report = convert_with_report(urdf, folder / name, options=options, thumbnail=thumbnail)
-        return Robot(asset, None, report)
-    equipped = import_module(LATER["RobotSettings"])
-    given = settings if isinstance(settings, equipped.RobotSettings) else equipped.read_settings(settings)
-    options = dataclasses.replace(given.conversion, **choices)
-    with output(out, force=force) as folder:
-        folder.mkdir()
-        report = equipped.build_robot(urdf, given, folder / name, options=options, thumbnail=thumbnail)
-        spec = equipped.load_robot(folder / name, own=True)
-        spec = dataclasses.replace(spec, asset=asset.resolve())
+        place = asset if folder is None else folder / name
+        how: dict[str, Any] = {"options": options, "thumbnail": thumbnail, "force": force}
+        if equipped is None:
+            return Robot(asset, None, convert_with_report(urdf, place, **how))
+        report = equipped.build_robot(urdf, given, place, **how)
+        spec = dataclasses.replace(equipped.load_robot(place, own=True), asset=asset.resolve())
     return Robot(asset, spec, report)
 
 

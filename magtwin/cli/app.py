@@ -20,7 +20,7 @@ from magtwin.cli.help import FLAGS, panel_of
 from magtwin.cli.options import Json, Quiet
 from magtwin.cli.progress import watched
 from magtwin.cli.settings import Environment, Settings, is_setting
-from magtwin.cli.terminal import Done, output_mode, print_error
+from magtwin.cli.terminal import Done, output_mode, print_error, print_json, refusal
 from magtwin.errors import TERMINATED, CalibrationWarning, InputError, MismatchWarning, RepairWarning
 from magtwin.files.folders import allow
 from magtwin.version import __version__
@@ -54,12 +54,20 @@ _TOO_LITTLE = re.compile(r"can't allocate memory|out of memory|std::bad_alloc", 
 _running: list[App] = []
 """The command that is running."""
 
+_typed: list[str] = []
+"""The arguments."""
+
+_read: list[Path] = []
+"""The files that the command may read."""
+
 
 def main(arguments: list[str], *, tell: Callable[[], str] | None = None) -> None:
     """Run the `magtwin` command, or print the text that `tell` gives in place of it."""
     debug = "--debug" in arguments
     _end_by_exceptions()
     _running.clear()
+    _read.clear()
+    _typed[:] = arguments
     try:
         arguments, folders = _allowed([a for a in arguments if a != "--debug"])
         with watched(), _warnings_in_lines(), allow(*folders):
@@ -88,7 +96,7 @@ def main(arguments: list[str], *, tell: Callable[[], str] | None = None) -> None
             raise
         if isinstance(error, InputError):
             _running[:] = _running or [app.parse_commands(arguments)[1][-1]]
-            _fail(error.in_flags(_flags()))
+            _fail(_named_as_typed(error.in_flags(_flags())))
         if text := _wrong_name(error, arguments):
             _fail(text)
         if isinstance(error, MemoryError) or _TOO_LITTLE.search(str(error)):
@@ -109,6 +117,16 @@ def refuse_command(arguments: list[str]) -> str:
     from magtwin.cli.mistakes import unknown_command
 
     _fail(unknown_command(arguments[0], more=arguments[1:2]), status=2)
+
+
+def _named_as_typed(text: str) -> str:
+    """A refusal that names the user's file in place of what was made of it in a temporary folder."""
+    import tempfile
+
+    for match in re.finditer(rf"({re.escape(tempfile.gettempdir())}/tmp\w{{8}})/[^\s:,;]*", text):
+        if _read and not any(file.absolute().is_relative_to(match[1]) for file in _read):
+            text = text.replace(match[0], str(_read[0]))
+    return text
 
 
 def _end_by_exceptions() -> None:
@@ -200,8 +218,8 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
         from magtwin.files.outputs import reading
 
         _running[:] = [command]
-        given = signature.bind_partial(*args, **options).arguments
-        with output_mode(as_json=json, quiet=quiet), reading(_files(given)):
+        _read[:] = _files(signature.bind_partial(*args, **options).arguments)
+        with output_mode(as_json=json, quiet=quiet), reading(_read):
             done = function(*args, **options)
             if isinstance(done, Done):
                 done.show()
@@ -290,4 +308,6 @@ def _warnings_in_lines() -> Iterator[None]:
 
 def _fail(text: str, status: int = 1) -> NoReturn:
     print_error(text, style="1;31" if status == 2 else "")
+    if "--json" in _typed:
+        print_json({"error": refusal(text)})
     sys.exit(status)

@@ -1,5 +1,6 @@
 """`magtwin bench`, its report, and comparisons."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -7,7 +8,7 @@ from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Dask, Flag, Force, Jobs, Names, Shard, Whole, pairs
-from magtwin.cli.terminal import Done, announce, continued_by_a_repeat, progress
+from magtwin.cli.terminal import Done, continued_by_a_repeat, progress, step
 
 Results = Annotated[Path, Parameter(required=True)]
 
@@ -70,8 +71,7 @@ def bench(
     from magtwin.bench.runner import benchmark
     from magtwin.parallel import parse_shard
 
-    announce(f"Benchmarking {suite}")
-    with continued_by_a_repeat(), progress("Running", "runs") as advance:
+    with continued_by_a_repeat(), progress(f"Benchmarking {suite}", "runs") as advance:
         made = benchmark(
             suite,
             out,
@@ -87,7 +87,9 @@ def bench(
             force=force,
             progress=advance,
         )
-    return Done(made.report(standings(made.rows, made.times, made.compensated)), out)
+    report = made.report(standings(made.rows, made.times, made.compensated))
+    page = ("magtwin", "bench", "report", out)
+    return Done(report, out, rest=shlex.join(map(str, page)), next=(page,))
 
 
 @bench_app.command
@@ -104,11 +106,12 @@ def report(*folders: Results, out: Path | None = None, force: Force = False) -> 
         Folder to make. Default: `report` in the first folder.
     """
     from magtwin.bench.report import report_results
+    from magtwin.files.outputs import free
 
-    announce("Reading the results")
-    made = folders[0] / "report" if out is None else out
+    (made,) = free(folders[0] / "report" if out is None else out, force=force)
+    step("Reading the results")
     report_results(folders, made, force=force)
-    return Done(wrote=made)
+    return Done(wrote=(made / "bench.html", made / "bench.json"), text="open bench.html in a browser")
 
 
 @bench_app.command

@@ -1,6 +1,5 @@
 """`magtwin doctor`: what is installed, and what each missing extra would add; and `magtwin completion`."""
 
-import shutil
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any, Literal
 
 from magtwin.cli.app import app
 from magtwin.cli.terminal import Done
+from magtwin.report.report import key
 
 ADDS = {
     "cluster": ("distributed", "work on a dask cluster (magtwin bench --dask, magtwin sweep --dask)"),
@@ -32,21 +32,20 @@ DRIVERS = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vul
 @app.command
 def doctor() -> Done:
     """List what is installed, what each missing extra would add, and how to install it."""
-    from magtwin.report.report import Report
-
     found = diagnose()
-    extras = {
-        name: f"installed: {extra['adds']}"
-        if extra["installed"]
-        else f"missing: {extra['adds']}; {extra['install']}"
-        for name, extra in found["extras"].items()
-    }
+    extras = found["extras"]
+    missing = {name: extra for name, extra in extras.items() if not extra["installed"]}
+    others = [f"{name}: {text}" for name, text in found["tools"].items() if text.startswith("not found; ")]
+    versions = ", ".join(f"{name} {version}" for name, version in found["packages"].items())
+    lines = [
+        f"magtwin {found['magtwin']}, Python {found['python']}: "
+        f"{len(extras) - len(missing)} of {len(extras)} extras are installed",
+        versions,
+        *(f"missing  {name}: {extra['adds']}; {extra['install']}" for name, extra in missing.items()),
+        *(f"missing  {text.replace('not found; ', '')}" for text in others if "magtwin[" not in text),
+    ]
     return Done(
-        Report(
-            f"magtwin {found['magtwin']}, Python {found['python']}",
-            metadata={"packages": found["packages"], "tools": found["tools"], "extras": extras},
-        ),
-        data=found,
+        lines=lines, data=found | {"tools": {key(name): text for name, text in found["tools"].items()}}
     )
 
 
@@ -57,7 +56,7 @@ def diagnose() -> dict[str, Any]:
     drivers = [file.stem for folder in DRIVERS for file in sorted(Path(folder).glob("*.json"))]
     vulkan = ", ".join(drivers) if find_library("vulkan") else ""
     tools = (
-        ("Rerun viewer", shutil.which("rerun"), "pip install rerun-sdk"),
+        ("Rerun viewer", find_spec("rerun_cli") and "installed", "pip install rerun-sdk"),
         ("Vulkan", vulkan, "apt install mesa-vulkan-drivers libvulkan1; pictures of recordings need it"),
         ("Newton", _version("newton"), "pip install 'magtwin[physics]'"),
         ("ROS 2, rclpy", find_spec("rclpy") and "installed", "source a ROS 2 installation"),

@@ -8,7 +8,7 @@ from typing import Any
 from magtwin.cli.app import app
 from magtwin.cli.options import Force, Names, Seed, pairs
 from magtwin.cli.ros import HERE, FramePrefix, WallS, Where, ros_app, spin
-from magtwin.cli.terminal import Done, announce, progress
+from magtwin.cli.terminal import Done, announce, progress, step
 from magtwin.errors import InputError, hint
 
 
@@ -73,15 +73,15 @@ def localize(
         Earlier run of the same session, with true poses.
     """
     from magtwin.figures.localization import save_localization
-    from magtwin.files.outputs import check_free
+    from magtwin.files.outputs import free
     from magtwin.io.formats import read_run
     from magtwin.localization.problem import OdometryModel, SensorModel
     from magtwin.tasks.localizing import ROBOT_NOISE, lever_arm_of, localization
 
-    check_free(out, force=force)
-    announce(f"Reading {run}")
+    step(f"Reading {run}")
     whole = read_run(run)
     told = _values("sensor", sensor, SensorModel)
+    (out,) = free(out, force=force)
     with progress("Localizing", "readings") as advance:
         result = localization(
             whole,
@@ -99,9 +99,11 @@ def localize(
             keep_particles=True,
             progress=advance,
         )
-    announce("Writing the estimate")
+    step("Writing the estimate")
     save_localization(result, out, force=force)
-    return Done(result.report(), out)
+    errors = ("position error, RMSE", "heading error, RMSE", "dead reckoning, RMSE")
+    look, rest = ("magtwin", "view", out / "localize.rrd"), f"magtwin info {out / 'run.parquet'}"
+    return Done(result.report(), out, (*errors, "ANEES per state", "bound"), rest=rest, next=(look,))
 
 
 @ros_app.command(name="localize", usage="Usage: magtwin ros localize [OPTIONS] SCENE [SETTING...]")

@@ -1,14 +1,16 @@
-"""Progress of commands on stderr: a bar on a terminal, else a line now and then.
+"""Progress of commands on stderr: one line that disappears on a terminal, else a line now and then.
 
-A thread watches each command. After `FIRST_S` of silence, and then every `EVERY_S`, it prints the current
-step with counts, rate and time left. So progress appears even while a library reports none. rich draws the
-bars, and is imported for them only.
+A thread watches each command. On a terminal it draws the current step with a bar, counts, rate and time left,
+and takes the line away at the end. Elsewhere it prints such a line after `FIRST_S` of silence, and then every
+`EVERY_S`. So progress appears even while a library reports none.
 """
 
+import os
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from threading import Event, Lock, Thread
 from typing import Any, TextIO
@@ -23,6 +25,12 @@ EVERY_S = 10.0
 
 TICK_S = 0.1
 """Time between two looks at the clock [s]."""
+
+DRAWN_S = 0.4
+"""Length of a step after which it is drawn on a terminal [s]."""
+
+BAR = 20
+"""Characters of a bar."""
 
 Advance = Callable[..., None]
 """What commands call and hand down to libraries as `progress`: `advance(done, total, what)`."""
@@ -63,6 +71,13 @@ class Step:
             return f"{number} x real time"
         return f"{number} {self.unit}/s" if self.unit else f"{number}/s"
 
+    def bar(self) -> str:
+        """How much is done, as a bar; empty while that is unknown."""
+        if not self.total:
+            return ""
+        full = round(BAR * min(1.0, self.done / self.total))
+        return f"[{'#' * full}{'.' * (BAR - full)}] "
+
     def line(self, now: float) -> str:
         """The step in a line, at a time `now` [s]."""
         count = f"{self.done:,.0f}" if self.done or self.total else ""
@@ -89,33 +104,42 @@ class Watch:
     """What one command is doing, and when it last printed a line about it.
 
     Args:
-        stream: Where lines go. Default: stderr; bars are drawn if that is a terminal.
+        stream: Where lines go. Default: stderr.
         clock: Gives the time [s].
+        terminal: Whether one line is drawn again and again. Default: whether stderr is a terminal that can.
     """
 
-    def __init__(self, *, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        *,
+        stream: TextIO | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        terminal: bool | None = None,
+    ) -> None:
         self._stream, self._clock = stream, clock
-        self._terminal = stream is None and sys.stderr.isatty()
+        able = stream is None and sys.stderr.isatty() and os.environ.get("TERM") != "dumb"
+        self._terminal, self._drawn = able if terminal is None else terminal, ""
         self._printed, self._reported = clock(), -float("inf")
         self._steps = [Step("Starting", "", self._printed)]  # innermost last
-        self._bar: Any = None
         self._silent = 0
         self._lock = Lock()
         self.announces, self.mute = True, False
         """Whether steps are announced, and whether nothing at all is printed."""
         self.end = Event()
 
-    def step(self, text: str, *, announced: bool = True) -> None:
+    def step(self, text: str, *, announced: bool = False) -> None:
         """Name what is done next, whose length is unknown; printed at once if `announced`."""
         with self._lock:
             self._steps[0] = Step(text, "", self._clock())
             if announced and self.announces and not self.mute:
+                self._draw("")
                 self._print(f"  {text} ...")
                 self._printed = self._clock()
 
     @contextmanager
     def silence(self) -> Iterator[None]:
         """Print no lines while a viewer is shown or the command waits for people."""
+        self.clear()
         self._silent += 1
         try:
             yield
@@ -128,28 +152,29 @@ class Watch:
         """A step of known length; gives the function that reports how far it is."""
         step = Step(title, unit, self._clock())
         self._steps.append(step)
+
+        def advance(done: float, total: float | None, what: str = "") -> None:
+            step.advance(self._clock(), done, total, what)
+            self.tick()  # a library that keeps the interpreter to itself starves the thread
+
         try:
-            with self._drawn(step) if self._terminal and not self.mute else nullcontext() as draw:
-
-                def advance(done: float, total: float | None, what: str = "") -> None:
-                    step.advance(self._clock(), done, total, what)
-                    if draw is not None:
-                        draw()
-                    self.tick()  # a library that keeps the interpreter to itself starves the thread
-
-                yield advance
+            yield advance
         finally:
             self._steps.remove(step)
             self._steps[0] = Step("Finishing", "", self._clock())
 
     def tick(self) -> None:
-        """Print a line if one is due."""
+        """Draw the line anew, or print one if it is due."""
         with self._lock:
-            now = self._clock()
-            if self._silent or self.mute or self._bar is not None or self.end.is_set():
+            now, step = self._clock(), self._steps[-1]
+            if self._silent or self.mute or self.end.is_set():
                 return
-            if now - self._printed >= FIRST_S and now - self._reported >= EVERY_S:
-                self._print(f"  {self._steps[-1].line(now)}")
+            if self._terminal:
+                if now - step.began >= DRAWN_S and now - self._reported >= TICK_S:
+                    self._draw(f"  {step.bar()}{step.line(now)}")
+                    self._reported = now
+            elif now - self._printed >= FIRST_S and now - self._reported >= EVERY_S:
+                self._print(f"  {step.line(now)}")
                 self._printed = self._reported = now
 
     def run(self) -> None:
@@ -157,37 +182,21 @@ class Watch:
         while not self.end.wait(TICK_S):
             self.tick()
 
-    def _print(self, line: str) -> None:
+    def clear(self) -> None:
+        """Take a drawn line away, before another is printed."""
+        with self._lock:
+            self._draw("")
+
+    def _draw(self, line: str) -> None:
+        line = line[: shutil.get_terminal_size().columns - 1]
+        if line != self._drawn:
+            self._print(f"\r\033[2K{printable_lines(line)}", end="")
+            self._drawn = line
+
+    def _print(self, line: str, end: str = "\n") -> None:
         with suppress(OSError, ValueError):  # stderr is closed
-            print(printable_lines(line), file=self._stream or sys.stderr, flush=True)
-
-    @contextmanager
-    def _drawn(self, step: Step) -> Iterator[Callable[[], None]]:
-        """A bar for a step, below those that are drawn already; gives what draws it anew."""
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        outer, speed, what = self._bar, TextColumn("{task.fields[rate]}"), TextColumn("{task.fields[what]}")
-        if outer is None:
-            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-            console = Console(stderr=True, force_terminal=True)
-            self._bar = Progress(
-                *columns, speed, TimeRemainingColumn(), what, console=console, redirect_stdout=False
-            )
-        bar = self._bar
-        task = bar.add_task(f"  {step.title}", total=None, rate="", what="")
-
-        def draw() -> None:
-            rate = step.speed(self._clock())
-            bar.update(task, completed=step.done, total=step.total or None, rate=rate, what=step.what)
-
-        try:
-            with bar if outer is None else nullcontext():
-                yield draw
-        finally:
-            if outer is not None:
-                bar.remove_task(task)
-            self._bar, self._printed = outer, self._clock()
+            text = line if not end else printable_lines(line)
+            print(text, file=self._stream or sys.stderr, flush=True, end=end)
 
 
 _watches: list[Watch] = []
@@ -206,6 +215,7 @@ def watched() -> Iterator[Watch]:
     finally:
         watch.end.set()
         thread.join()
+        watch.clear()
         _watches.remove(watch)
 
 
@@ -215,13 +225,13 @@ def current() -> Watch:
 
 
 def announce(text: str) -> None:
-    """Print what is done next, on stderr; with --json only if it takes long."""
-    current().step(text)
+    """Print what a live command does, or a note, on stderr; with --json only if it takes long."""
+    current().step(text, announced=True)
 
 
 def step(text: str) -> None:
-    """Name what is done next; it is printed only if it takes long."""
-    current().step(text, announced=False)
+    """Name what is done next; it is shown only while it goes on, if it takes long."""
+    current().step(text)
 
 
 def progress(title: str, unit: str = "") -> Any:

@@ -307,9 +307,11 @@ def record(
     topic
         Topic to record beside those of the robot, such as /scan_2. May be repeated.
     """
+    from magtwin.files.outputs import free
     from magtwin.io.bags import RawBagWriter
     from magtwin.ros.record import Recorder
 
+    (out,) = free(out, force=force)
     writer = RawBagWriter(out, force=force)
     try:
         with where.bus("magtwin_record", sim_time=sim_time, duration_s=duration_s) as bus:
@@ -323,12 +325,12 @@ def record(
     if not sum(counts.values()):
         raise InputError("nothing was recorded: no node offers these topics; check --domain and --namespace")
     lines = [f"{count:8d}  {name}" for name, count in counts.items()]
-    text = "\n".join([*lines, f"Wrote {out}; magtwin info {out}"])
     missing = recorder.missing()
     for name, why in missing.items():
         _warn(f"{name} was not recorded: {why}")
     data = {"messages": counts, "missing": missing}
-    return Done(text=text, data=data, wrote=out, status=1 if missing else 0)
+    following = (("magtwin", "info", out),)
+    return Done(lines=lines, data=data, wrote=out, next=following, status=1 if missing else 0)
 
 
 @ros_app.command(name="replay")

@@ -1,10 +1,14 @@
-"""Output of commands: reports on stdout, one JSON document with --json, nothing with --quiet."""
+"""Output of commands: verdict, figures, files, what to type next; JSON with --json, nothing with --quiet."""
 
 import io
 import json
 import os
+import re
+import shlex
+import shutil
 import sys
-from collections.abc import Callable, Iterator
+import textwrap
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +16,24 @@ from typing import Any, TextIO, cast
 
 from magtwin.cli.progress import announce, current, progress, silence, step
 from magtwin.errors import InputError
-from magtwin.report.summary import printable, printable_lines
+from magtwin.report.report import jsonable
+from magtwin.report.summary import WIDTH, aligned, clipped, listed, printable, printable_lines
 
 __all__ = ["announce", "printable", "progress", "silence", "step"]  # commands import these from here too
 
 WIDE = 100_000
 """Columns of output that goes to a file or another program: no line is broken."""
+
+MOST_LINES, MOST_FIGURES, MOST_NOTES = 12, 5, 5
+"""Most lines, figures and notes that a command prints; `magtwin info`, pages and --json have all."""
+
+ORIGIN = ("licences", "columns", "features", "inputs")
+"""Lists of a report that only `magtwin info` prints, as it does those of checksums."""
+
+FLAG = "flag_"
+"""Figures with this in their names count readings in doubt, and are printed in one line."""
+
+CHECKSUM, LISTS = re.compile(r"[0-9a-f]{32}"), (dict, list, tuple)
 
 
 @dataclass(frozen=True)
@@ -25,38 +41,157 @@ class Done:
     """Result of a command, printed at its end: `Done(report, file)`."""
 
     report: Any = None
-    """A report: `print_report` shows it, and its `to_json` is the JSON."""
+    """A report; its `to_json` is the JSON."""
     wrote: Path | str | tuple[Path | str, ...] = ()
     """Files and folders that the command wrote."""
+    figures: Sequence[str] = ()
+    """Names of the figures that are printed. Default: the first."""
+    lines: Sequence[str] = ()
+    """What is printed in place of a report."""
     text: str = ""
-    """Last lines for people, in place of "Wrote ..."."""
-    table: Callable[[], None] | None = None
-    """Prints the report for people, in place of `print_report`."""
+    """Added to the line of what was written; or the only line."""
+    rest: str = ""
+    """Command or file that has what is not printed. Default: --json."""
+    next: Sequence[Sequence[object]] = ()
+    """Commands to type next, each by its words."""
     data: Any = None
     """Content of the JSON, in place of the report's."""
+    whole: bool = False
+    """Whether all of the report is printed."""
     status: int = 0
     """Exit status."""
 
     def show(self) -> None:
         """Print it, as JSON if --json was given, and exit if the status is not 0."""
+        from magtwin.files.outputs import instead
+
         wrote = [str(path) for path in (self.wrote if isinstance(self.wrote, tuple) else (self.wrote,))]
+        following = [shlex.join(map(str, words)) for words in self.next]
+        written = [folder for path in wrote for folder in (Path(path), *Path(path).parents)]
+        renamed = [str(asked) for asked, new in instead().items() if new in written]
+        said = (
+            f"{' and '.join(renamed)} exist{'s' if len(renamed) == 1 else ''}: wrote" if renamed else "Wrote"
+        )
+        said = f"{said} {listed(wrote, WIDTH)}" if wrote else ""
+        if not (_mode.json or _mode.quiet):
+            told = ": ".join(filter(None, (said, self.text or _inside(wrote))))
+            tail = [f"{told}; --force replaces" if renamed else told] if told else []
+            tail += [f"{'       ' if k else 'Next:  '}{words}" for k, words in enumerate(following)]
+            for line in (*self._told(MOST_LINES - len(tail)), *tail):
+                say(line)
+        elif renamed:
+            print_error(said)
         if _mode.json:
             data = self.data
             if data is None:
                 data = {} if self.report is None else json.loads(self.report.to_json())
-            if wrote and isinstance(data, dict):
-                data = {**data, "wrote": wrote}
-            text = json.dumps(data, indent=2, ensure_ascii=False)
-            print("".join(c if c.isprintable() or c == "\n" else json.dumps(c)[1:-1] for c in text))  # noqa: T201
-        else:
-            if self.table is not None:
-                self.table()
-            elif self.report is not None:
-                print_report(self.report)
-            if self.text or wrote:
-                say(self.text or f"Wrote {', '.join(wrote)}")
+            if isinstance(data, dict):
+                data = {**data, **({"wrote": wrote} if wrote else {})}
+                data |= {"next": following} if following else {}
+            print_json(data)
         if self.status:
             sys.exit(self.status)
+
+    def _told(self, room: int) -> list[str]:
+        """The report in a number of lines: title, verdict, figures, notes, and where the rest is."""
+        if self.report is None:
+            return _cut(self.lines, room, self.rest)
+        report, named = self.report, {figure.name: figure for figure in self.report.figures}
+        flags = [figure for figure in report.figures if FLAG in figure.name]
+        lines = [_bold(report.title), *([_bold(report.verdict)] if report.verdict else [])]
+        if self.whole:
+            return [*lines, *_rows(report.figures), *_facts(report.metadata)]
+        chosen = [named[name] for name in self.figures if name in named]
+        if not self.figures:
+            chosen = [figure for figure in report.figures if figure not in flags]
+        lines += _rows(chosen[:MOST_FIGURES], clip=True)
+        if flags:
+            counts = ", ".join(f"{f.value:,} {f.name.replace(FLAG, '')}" for f in flags)
+            lines.append(f"readings in doubt  {counts}")
+        notes = [line for name, each in report.metadata.items() for line in _notes(name, each, brief=True)]
+        facts = [each for each in report.metadata.values() if not isinstance(each, LISTS) and each != ""]
+        left = len(report.figures) - len(flags) - min(len(chosen), MOST_FIGURES) + len(facts)
+        room = min(room - len(lines), MOST_NOTES + 2)
+        return lines + _cut([*self.lines, *notes], room, self.rest, left if self.rest else 0)
+
+
+def _cut(lines: Sequence[str], most: int, rest: str, left: int = 0) -> list[str]:
+    """At most so many lines, the last of which tells how many more there are, beside `left`, and where."""
+    if len(lines) + bool(left) <= most and not left:
+        return list(lines)
+    shown = max(min(most - 1, len(lines)), 0)
+    return [
+        *lines[:shown],
+        f"and {len(lines) - shown + left:,} more {'facts' if left else 'lines'}: {rest or 'add --json'}",
+    ]
+
+
+def _inside(wrote: Sequence[str]) -> str:
+    """What is in the only folder that was written; "" for files."""
+    if len(wrote) != 1 or not Path(wrote[0]).is_dir():
+        return ""
+    return listed(sorted(file.name for file in Path(wrote[0]).glob("[!.]*")))
+
+
+def _bold(text: str) -> str:
+    """A title or verdict, whose lines are broken between words on a terminal."""
+    columns = width()
+    return printable(text) if columns is None else textwrap.fill(printable(text), columns)
+
+
+def width() -> int | None:
+    """Columns of the terminal; None for output that goes elsewhere."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() or os.environ.get("COLUMNS") else None
+
+
+def _rows(figures: Sequence[Any], *, clip: bool = False) -> list[str]:
+    """Figures as lines of name, value, unit and note; a terminal's notes are clipped to its width."""
+    numbers, words, columns = list[tuple[str, ...]](), list[tuple[str, ...]](), width()
+    for figure in figures:
+        value = figure.value
+        if isinstance(value, str):
+            words.append((figure.name, f"{value} {figure.unit}".rstrip(), figure.note))
+            continue
+        spread = f"± {_rounded(figure.spread)} " if figure.spread is not None else ""
+        shown = f"{value:,.6g}" if isinstance(value, float) else f"{value:,}"
+        numbers.append((figure.name, shown, f"{spread}{figure.unit}", figure.note))
+    lines = [*aligned(numbers, right=(1,)), *aligned(words)]
+    return [clipped(line, columns) if clip and columns else line for line in lines]
+
+
+def _facts(metadata: dict[str, Any]) -> list[str]:
+    """All metadata: words by name, and then lists."""
+    words = [(name, str(each)) for name, each in metadata.items() if not isinstance(each, LISTS)]
+    lists = [line for name, each in metadata.items() for line in _notes(name, each)]
+    return [*aligned([row for row in words if row[1]]), *lists]
+
+
+def _notes(name: str, entry: Any, *, brief: bool = False) -> list[str]:
+    """A list or table of metadata: its name, and a line for each entry."""
+    if not isinstance(entry, LISTS) or (brief and (name in ORIGIN or CHECKSUM.search(str(entry)))):
+        return []
+    pairs = entry.items() if isinstance(entry, dict) else (("-", item) for item in entry)
+    return [name, *(f"  {printable(str(key))}  {printable(str(item))}" for key, item in pairs)]
+
+
+def refusal(text: str) -> dict[str, str]:
+    """A refusal for JSON: its text, and the file, the parameter and the way on that it names."""
+    file, colon, _ = text.partition(": ")
+    looks = os.path.lexists(file) or (" " not in file and ("/" in file or "." in file))
+    parameter = re.search(r"--[a-z][a-z0-9-]*", text)
+    found = {
+        "message": text,
+        "file": file if colon and looks else "",
+        "parameter": parameter[0] if parameter else "",
+        "hint": text.rpartition("; ")[2] if "; " in text else "",
+    }
+    return {name: each for name, each in found.items() if each}
+
+
+def print_json(data: Any) -> None:
+    """Print one JSON document on stdout."""
+    text = json.dumps(jsonable(data), indent=2, ensure_ascii=False)
+    print("".join(c if c.isprintable() or c == "\n" else json.dumps(c)[1:-1] for c in text))  # noqa: T201
 
 
 @dataclass
@@ -86,19 +221,22 @@ def output_mode(*, as_json: bool, quiet: bool) -> Iterator[None]:
 def say(text: str) -> None:
     """Print a line on stdout; nothing with --json or --quiet."""
     if not (_mode.json or _mode.quiet):
+        current().clear()
         print(printable_lines(text))  # noqa: T201
 
 
 def note(text: str) -> None:
     """Print an indented line on stderr; nothing with --quiet."""
     if not _mode.quiet:
+        current().clear()
         print(f"  {printable_lines(text)}", file=sys.stderr)  # noqa: T201
 
 
 def print_error(text: str, style: str = "") -> None:
     """Print one line on stderr, in colour on a terminal; --quiet prints it too."""
     text = f"magtwin: {printable(' '.join(text.split()))}"
-    coloured = style and sys.stderr.isatty()
+    coloured = style and sys.stderr.isatty() and not os.environ.get("NO_COLOR")
+    current().clear()
     print(f"\033[{style}m{text}\033[0m" if coloured else text, file=sys.stderr)  # noqa: T201
 
 
@@ -113,6 +251,18 @@ def continued_by_a_repeat(*, when: bool = True) -> Iterator[None]:
         raise
 
 
+def stdout_console() -> Any:
+    """A console for help that goes to a file or another program: no line is broken."""
+    from rich.console import Console as RichConsole
+
+    class Console(RichConsole):
+        def on_broken_pipe(self) -> None:
+            raise  # the program ends as after any other output
+
+    columns = None if os.environ.get("COLUMNS") else WIDE
+    return Console(highlight=False, width=columns, file=cast(TextIO, _Trimmed()))
+
+
 class _Trimmed(io.TextIOBase):
     """Stdout without the spaces that rich fills up lines with."""
 
@@ -125,129 +275,23 @@ class _Trimmed(io.TextIOBase):
         sys.stdout.flush()
 
 
-def stdout_console() -> Any:
-    """A console on stdout: as wide as the terminal, or as its text if stdout is no terminal."""
-    from rich.console import Console as RichConsole
-
-    class Console(RichConsole):
-        def on_broken_pipe(self) -> None:
-            raise  # the program ends as after any other output
-
-    if _mode.json or _mode.quiet:
-        console = Console(file=io.StringIO(), highlight=False)
-    elif sys.stdout.isatty():
-        console = Console(highlight=False)
-    else:
-        width = None if os.environ.get("COLUMNS") else WIDE
-        console = Console(highlight=False, width=width, file=cast(TextIO, _Trimmed()))
-    console.push_render_hook(cast(Any, _PrintableTexts()))
-    return console
-
-
-class _PrintableTexts:
-    """Hook of a console: escapes control characters in all that is printed, but for those of styles."""
-
-    def process_renderables(self, renderables: list[Any]) -> list[Any]:
-        """What a console is to print, escaped."""
-        return [_Escaped(renderable) for renderable in renderables]
-
-
-@dataclass(frozen=True)
-class _Escaped:
-    """Something to print, with control characters of its texts escaped."""
-
-    content: Any
-
-    def __rich_console__(self, console: Any, options: Any) -> Iterator[Any]:
-        from rich.segment import Segment
-
-        for text, style, control in console.render(self.content, options):
-            yield Segment(text if control else printable_lines(text), style, control)
-
-
 def check_suffix(path: Path, suffixes: tuple[str, ...], what: str) -> None:
     """Refuse an output whose name has another suffix."""
     if path.suffix.lower() not in suffixes:
         raise InputError(f"{path}: {what} ends in {' or '.join(suffixes)}")
 
 
-def check_output(path: Path | None, suffixes: tuple[str, ...], what: str, *, force: bool) -> None:
-    """Refuse an output whose name has another suffix, or that exists without --force."""
-    from magtwin.files.outputs import check_free
+def named(
+    path: Path, suffixes: tuple[str, ...], what: str, *, beside: Sequence[str] = (), force: bool
+) -> Path:
+    """A free name for an output of one of the suffixes: `magtwin.files.outputs.free`."""
+    from magtwin.files.outputs import free
 
-    if path is not None:
-        check_suffix(path, suffixes, what)
-        check_free(path, force=force)
-
-
-def print_report(report: Any) -> None:
-    """Print a report as tables; nothing with --json or --quiet."""
-    if _mode.json or _mode.quiet:
-        return
-    from rich.table import Table
-    from rich.text import Text
-
-    console = stdout_console()
-    numbers, words = ((Table(show_header=False, box=None, pad_edge=False)) for _ in range(2))
-    for column in ("name", "value", "unit"):
-        numbers.add_column(column, justify="right" if column == "value" else "left", no_wrap=True)
-    numbers.add_column("note", overflow="fold")
-    words.add_column("name", no_wrap=True)
-    words.add_column("text", overflow="fold")
-    rows, pairs, lists = _content(report)
-    for *cells, note in rows:
-        numbers.add_row(*map(Text, cells), Text(note, style="dim"))
-    for pair in pairs:
-        words.add_row(*map(Text, pair))
-    console.print(Text(printable(report.title), style="bold"))
-    for table in (numbers, words):
-        if table.row_count:
-            console.print(table)
-    if report.verdict:
-        console.print(Text(printable(report.verdict), style="bold"), soft_wrap=True)
-    for name, entries in lists:
-        console.print(Text(name))
-        for key, item in entries:
-            _print_entry(console, key, item)
-
-
-Rows = list[tuple[str, ...]]
-
-
-def _content(report: Any) -> tuple[Rows, Rows, list[tuple[str, Rows]]]:
-    """A report's figures as name, value, unit and note; its words by name; and its lists by name."""
-    numbers: Rows = []
-    words: Rows = []
-    lists: list[tuple[str, Rows]] = []
-    for figure in report.figures:
-        if isinstance(figure.value, str):
-            note = f"  ({figure.note})" if figure.note else ""
-            words.append((figure.name, printable(f"{figure.value} {figure.unit}{note}".strip())))
-        else:
-            value = f"{figure.value:,.6g}" if isinstance(figure.value, float) else f"{figure.value:,}"
-            spread = f"± {_rounded(figure.spread)}" if figure.spread is not None else ""
-            numbers.append((figure.name, value, f"{spread} {figure.unit}".strip(), figure.note))
-    for name, entry in report.metadata.items():
-        if isinstance(entry, (dict, list)):
-            entries = entry.items() if isinstance(entry, dict) else (("", item) for item in entry)
-            lists.append((name, [(printable(str(key)), printable(str(item))) for key, item in entries]))
-        elif entry != "":
-            words.append((name, printable(str(entry))))
-    return numbers, words, lists
+    check_suffix(path, suffixes, what)
+    return free(path, beside=beside, force=force)[0]
 
 
 def _rounded(spread: float) -> str:
     """A spread to three digits, without an exponent below 1e9."""
     text = f"{spread:,.3g}"
     return f"{round(spread, 3 - len(str(int(spread)))):,.0f}" if "e+" in text and spread < 1e9 else text
-
-
-def _print_entry(console: Any, key: str, text: str) -> None:
-    """Print an entry of a list below its title: on one line if it fits, else the text below its key."""
-    from rich.padding import Padding
-    from rich.text import Text
-
-    line = f"{key}  {text}" if key else text
-    fits = not key or len(line) + 2 <= console.width
-    for part, indent in ((line, 2),) if fits else ((key, 2), (text, 4)):
-        console.print(Padding(Text(part, overflow="fold"), (0, 0, 0, indent), expand=False))

@@ -4,6 +4,7 @@ magtwin ships none of them. Each source is a table: name, checksum, and path in 
 commit.
 """
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from urllib.parse import urlsplit
 
 from magtwin.errors import InputError, find
 from magtwin.export.validation.isaac_sim import FILES, copy_folder
+from magtwin.files.file import sha256
 from magtwin.files.outputs import output
 
 UNSTATED = "NOASSERTION"
@@ -96,6 +98,12 @@ def default_folder(name: str) -> Path:
     return copy_folder() if name == "isaac-rules" else Path(name)
 
 
+def is_complete(name: str, folder: Path) -> bool:
+    """Whether a folder has all files of a source, with the pinned checksums."""
+    files = [each for source in find("source", name, SOURCES) for each in source.files()]
+    return all((folder / file).is_file() and sha256(folder / file) == checksum for file, checksum, _ in files)
+
+
 def fetch(
     name: str,
     dest: Path,
@@ -142,7 +150,9 @@ def fetch(
             except ValueError as error:  # pooch: the checksum differs
                 raise InputError(f"{url}: its SHA-256 is not {checksum}; nothing was kept") from error
             except OSError as error:  # requests' exceptions are OSErrors
-                reason = str(error).split("\n")[0]
-                raise InputError(f"{url}: could not be fetched ({reason}); nothing was kept") from error
+                cause = re.search(r"\[Errno -?\d+\] ([^'\")]+)", str(error))
+                reason = cause[1] if cause else str(error).split("\n")[0]
+                text = f"{url}: could not be fetched ({reason}); nothing was kept; try again with a network"
+                raise InputError(f"{text}, or from a mirror with `base_url`") from error
         progress(len(jobs), len(jobs), "")
     return [dest / file for file, _, _ in jobs]

@@ -3,6 +3,9 @@
 An output is written in a hidden folder beside its place, is brought to the disk, and is then renamed. A
 killed process leaves its hidden folder; each output is then as it was before, or whole and new.
 
+A command asks for its names by `free`: an output that exists is not in the way, NAME-1 is made. Functions
+refuse an output that exists, but for `force=True`.
+
 A link at the place of an output is itself replaced: what it leads to stays as it is, so that no link in a
 stranger's folder leads a write elsewhere. Only a file that is rewritten in its place is found through a link.
 """
@@ -15,12 +18,18 @@ import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from zlib import crc32
 
 from magtwin.errors import InputError
+
+try:
+    import fcntl
+except ImportError:  # Windows: names are not kept from other commands
+    fcntl = None  # type: ignore[assignment]
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors of a disk that is full or read-only."""
@@ -37,6 +46,9 @@ _WRITTEN = re.compile(
 _inputs: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())
 """Files and folders that the command reads, which no output may remove."""
 
+_names: ContextVar["_Names | None"] = ContextVar("names", default=None)
+"""Names of the command's outputs; None outside of a command."""
+
 _pending: ContextVar["tuple[list[_Aside], list[Callable[[], object]]] | None"] = ContextVar(
     "pending", default=None
 )
@@ -50,15 +62,100 @@ def check_free(path: str | os.PathLike[str], *, force: bool = False, in_place: b
         InputError: It exists and `force` is False, or it is an input of the command and not `in_place`. Or it
             cannot be replaced, or be the name of an output.
     """
-    path = Path(path)
-    if wrong := _wrong(path):
-        raise InputError(f"{path if str(path).strip() else repr(str(path))}: {wrong}")
+    path = _named(Path(path))
     if os.path.lexists(path) and not force:
         link = " as a link" if path.is_symlink() else ""
         text = f"{path}: exists already{link}; give `force=True` to replace it, or another name"
         raise InputError(text, parameter="force")
     if not in_place and Path(os.path.realpath(path)) in _inputs.get():
         raise InputError(f"{path}: is read by this command and would be replaced; give another name")
+    return path
+
+
+def free(*paths: Path, beside: Iterable[str] = (), force: bool = False) -> list[Path]:
+    """Names for a command's outputs that nothing has yet: NAME, else NAME-1, NAME-2, ..., all of one number.
+
+    Until the command ends, no other command is given the same names: a hidden file beside each of them is
+    locked. A killed command leaves that file, which the next one takes over and removes.
+
+    Args:
+        paths: The names asked for. Their folders are created; those that remain empty are removed.
+        beside: Endings of what is made beside an output: ".md" stands for NAME.md.
+        force: Whether outputs that exist are replaced: the names are those asked for.
+
+    Raises:
+        InputError: A folder cannot be written, or the path cannot be the name of an output.
+    """
+    if force:
+        return [check_free(path, force=True) for path in paths]
+    names, endings, number = _names.get(), tuple(beside), 0
+    while True:
+        found = [_numbered(_named(path), number) for path in paths]
+        others = (path.with_name(f"{path.stem}{ending}") for path in found for ending in endings)
+        taken = any(map(os.path.lexists, (*found, *others)))
+        if not taken and (names is None or all(map(names.claim, found))):
+            instead().update(zip(paths, found, strict=True) if number else ())
+            return found
+        number += 1
+
+
+def instead() -> dict[Path, Path]:
+    """Names that `free` gave in place of those asked for, so far in this command."""
+    names = _names.get()
+    return {} if names is None else names.instead
+
+
+def _numbered(path: Path, number: int) -> Path:
+    """NAME-1.txt for NAME.txt; NAME_1.py, as a module's name has no hyphen."""
+    mark = "_" if path.suffix.lower() == ".py" else "-"
+    return path.with_name(f"{path.stem}{mark}{number}{path.suffix}") if number else path
+
+
+@dataclass
+class _Names:
+    """Names that a command claimed, and what is undone at its end."""
+
+    end: ExitStack
+    instead: dict[Path, Path] = field(default_factory=dict)
+
+    def claim(self, path: Path) -> bool:
+        """Keep a name from other commands; False if one has it, or has just made the output."""
+        if fcntl is None:
+            return True
+        lock = path.with_name(f".{path.name[:60]}{HIDDEN}{crc32(os.fsencode(path.name)):08x}").absolute()
+        try:
+            for folder in reversed([folder for folder in lock.parents if not folder.exists()]):
+                folder.mkdir(exist_ok=True)
+                self.end.callback(_remove_empty, folder)
+            number = os.open(lock, os.O_RDWR | os.O_CREAT, 0o600)
+        except OSError as error:
+            reason = f"cannot be written ({error.strerror})"
+            raise InputError(f"{path}: {reason}; give a name in another folder") from error
+        try:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            mine = os.path.samestat(os.fstat(number), lock.stat())
+        except BlockingIOError:
+            os.close(number)
+            return False
+        except OSError:  # a file system without locks, or the file has gone
+            mine = lock.exists()
+        if not mine:  # the command that had it ended in this moment, and removed the file
+            os.close(number)
+            return self.claim(path)
+        self.end.callback(os.close, number)
+        self.end.callback(lock.unlink, missing_ok=True)
+        return not os.path.lexists(path)
+
+
+def _remove_empty(folder: Path) -> None:
+    with suppress(OSError):
+        folder.rmdir()
+
+
+def _named(path: Path) -> Path:
+    """A path that can be the name of an output; raises InputError if it cannot."""
+    if wrong := _wrong(path):
+        raise InputError(f"{path if str(path).strip() else repr(str(path))}: {wrong}")
     return path
 
 
@@ -78,7 +175,10 @@ def _wrong(path: Path) -> str:
     if any("\udc80" <= letter <= "\udcff" for letter in path.name):
         return "its name is not UTF-8, and file formats store names as UTF-8; give another"
     above = next(folder for folder in path.parents if folder.exists())
-    return "" if above.is_dir() else f"cannot be written, as {above} is no folder; give another name"
+    if not above.is_dir():
+        return f"cannot be written, as {above} is no folder; give another name"
+    may = path.is_symlink() or os.access(above, os.W_OK | os.X_OK)  # in place, a link leads elsewhere
+    return "" if may else f"cannot be written, as {above.absolute()} is read-only; give a name elsewhere"
 
 
 def _doomed(folder: Path, new: Path) -> str:
@@ -159,16 +259,21 @@ def output(
 
 @contextmanager
 def reading(files: Iterable[Path]) -> Iterator[None]:
-    """Let no output of the block remove these files and folders; those that do not exist are ignored."""
+    """A command that reads files and folders: no output of the block removes them, and `free` claims names.
+
+    Files that do not exist are ignored.
+    """
     named = set[Path]()
     for file in files:
         with suppress(OSError, ValueError):  # a text that is too long for a name
             named |= {Path(os.path.realpath(file))} if file.exists() else set()
-    token = _inputs.set(tuple(sorted(named)))
-    try:
-        yield
-    finally:
-        _inputs.reset(token)
+    with ExitStack() as end:
+        tokens = _inputs.set(tuple(sorted(named))), _names.set(_Names(end))
+        try:
+            yield
+        finally:
+            _inputs.reset(tokens[0])
+            _names.reset(tokens[1])
 
 
 def not_read(value: str | Path) -> None:

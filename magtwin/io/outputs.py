@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from magtwin.errors import InputError
 from magtwin.files.file import existing
 from magtwin.files.kinds import COMMANDS, RUN, kind_of
-from magtwin.files.outputs import check_free, output, transaction
+from magtwin.files.outputs import check_free, free, output, transaction
 from magtwin.io.formats import FORMATS, format_of, format_to_write, read_run, write_run
 from magtwin.path import CASES, PATHS, read_path_csv
 from magtwin.path import Path as Planned
@@ -81,6 +81,7 @@ def drive(
     scans: bool = False,
     metadata: Mapping[str, str | int] = MappingProxyType({}),
     report: Callable[[str], Any] = lambda text: None,
+    tell: Callable[[str], Any] = lambda text: None,
     **options: Any,
 ) -> Driven:
     """Drive a scene's robot along a path, by commands, or as in a recorded run.
@@ -95,6 +96,7 @@ def drive(
         scans: Whether the LiDAR's rays are cast.
         metadata: Metadata of the run, such as names of files that move with it.
         report: Called with a line about each step.
+        tell: Called with a line about what is driven otherwise than it was asked for.
         options: Of `magtwin.open_twin` and `magtwin.simulate`.
 
     Raises:
@@ -107,9 +109,9 @@ def drive(
     planned = what if isinstance(what, Planned) else None
     if planned is not None and planned.placing:
         how = _placing(planned.placing, named=path in (*PATHS, *CASES))
-        report(f"Path {planned.name} is {how} to fit this floor and what stands on it")
+        tell(f"Path {planned.name} is {how} to fit this floor and what stands on it")
     if isinstance(what, Commands) and (text := what.beyond(twin.scene.robot.drive)):
-        report(text)
+        tell(text)
     report(f"Driving {getattr(what, 'name', 'random' if what == 'random' else 'as recorded')}")
     run = simulate(twin, what, seed=seed, **options).with_metadata(**metadata)
     if scans:
@@ -151,7 +153,7 @@ class Outputs:
 
     @classmethod
     def of(cls, out: "list[Path] | tuple[Path, ...]", *, scans: bool = False, **options: Any) -> "Outputs":
-        """Outputs by their names; refuses unknown formats, two outputs of one name, and files that exist."""
+        """Outputs by their names; refuses unknown formats and two outputs of one name."""
         folders = [path for path in out if not path.suffix]
         files = tuple(path for path in out if path.suffix)
         if len(folders) > 1:
@@ -169,9 +171,22 @@ class Outputs:
             if value is not None and not any(takes in format_of(file).takes for file in files):
                 kind = "a bag" if takes == "units" else "a USD layer"
                 raise InputError(f"`{name}` is for {kind}; name one as an output, or drop it", parameter=name)
-        for target in targets:
-            check_free(target, force=made.force)
         return made
+
+    def free(self, robots: Iterable[str] = ()) -> "Outputs":
+        """The outputs by names that nothing has yet; see `magtwin.files.outputs.free`.
+
+        Args:
+            robots: Names of the robots, where several are written, each to files of its own.
+        """
+        named, kinds = [*([self.folder] if self.folder else []), *self.files], {f.suffix for f in self.files}
+        scans = [".scans.parquet"] if self.scans else []
+        ends = [*scans, f"{named[0].suffix}.parts"]
+        ends += [f".{robot}{end}" for robot in robots for end in (*kinds, *ends)]
+        found = free(*named, beside=ends, force=self.force)
+        files = tuple(found[len(found) - len(self.files) :])
+        tables = tuple(_scans_of(file) for file in files if scans and file.suffix.lower() == ".parquet")
+        return replace(self, folder=found[0] if self.folder else None, files=files, scans=tables)
 
     @property
     def targets(self) -> list[Path]:

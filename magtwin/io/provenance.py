@@ -81,9 +81,11 @@ class Repeat:
             unit = COLUMNS[d.column].unit if d.column in COLUMNS else ""
             figures.append(Figure(d.column, d.greatest, unit if unit != "bool" else "", None, note))
         count = len(self.original) - len(self.differences)
-        figures.append(Figure("equal columns", count, f"of {len(self.original)}"))
+        figures.append(Figure("equal columns", count, note=f"of {len(self.original)}"))
         figures.append(Figure("equal", "yes, to the bit" if self.equal else "no"))
-        return Report(title, tuple(figures), {"changed": list(self.causes)} if self.causes else {})
+        made = "The run was made again, and is equal to the bit."
+        verdict = made if self.equal else f"DIFFERENT: {len(self.differences)} columns are not the same bits."
+        return Report(title, tuple(figures), {"changed": list(self.causes)} if self.causes else {}, verdict)
 
 
 def repeat_of(file: str | FilePath, scene: str | FilePath | None = None) -> Repeat:

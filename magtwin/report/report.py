@@ -1,10 +1,15 @@
 """Report: numbers with unit, spread and provenance, for people and for scripts."""
 
 import json
+import math
+import re
 from dataclasses import dataclass, field
 from typing import Any
 
 from magtwin.report.summary import LINES, Summarized, Summary
+
+_NUMBERS = re.compile(r"-?\d+(\.\d+)?(, -?\d+(\.\d+)?)+")
+"""A text of several numbers, such as the place of a sensor."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +37,23 @@ class Report(Summarized):
     """A judgement in one line; see `magtwin.report.verdict`."""
 
     def to_json(self) -> str:
-        """The report as one JSON object; a figure becomes {value, unit, spread, note}."""
-        figures = {
-            f.name: {k: v for k, v in vars(f).items() if k != "name" and v not in ("", None)}
-            for f in self.figures
-        }
-        content = {"title": self.title, "figures": figures, "metadata": self.metadata}
-        return json.dumps(content | ({"verdict": self.verdict} if self.verdict else {}), indent=2)
+        """The report as one JSON object: figures by names that end in their unit, and their notes.
+
+        `Figure("distance driven", 14.7, "m")` is `"distance_driven_m": 14.7`. A spread is a figure of its
+        own: `"b_total_sd_nt": 2370.0` beside `"b_total_nt"`.
+        """
+        figures, notes = dict[str, Any](), dict[str, str]()
+        for f in self.figures:
+            name = key(f.name, f.unit)
+            figures[name] = f.value
+            if f.spread is not None:
+                figures[key(f"{f.name.removesuffix('_nt')} sd", f.unit)] = f.spread
+            notes |= {name: f.note} if f.note else {}
+        facts = {key(name): value for name, value in self.metadata.items()}
+        content = {"title": self.title} | ({"verdict": self.verdict} if self.verdict else {})
+        return json.dumps(
+            jsonable(content | {"figures": figures, "notes": notes, "metadata": facts}), indent=2
+        )
 
     def _summary(self) -> Summary:
         """The figures; a notebook also shows the metadata."""
@@ -50,6 +65,32 @@ class Report(Summarized):
             ("fact", "value"),
             metadata,
         )
+
+
+def key(name: str, unit: str = "") -> str:
+    """A name as a key of JSON: words of small letters and digits, and the unit at the end."""
+    words, ending = (
+        re.sub(r"[^a-z0-9]+", "_", text.replace("%", " percent ").lower()).strip("_") for text in (name, unit)
+    )
+    return words if f"_{words}".endswith(f"_{ending}") or not ending else f"{words}_{ending}"
+
+
+def jsonable(content: Any) -> Any:
+    """Content that JSON has: null for numbers that are not finite, lists for texts of numbers and commas."""
+    if isinstance(content, dict):
+        return {str(name): jsonable(value) for name, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [jsonable(value) for value in content]
+    if isinstance(content, float) and not math.isfinite(content):
+        return None
+    if isinstance(content, str) and _NUMBERS.fullmatch(content):
+        return [float(number) for number in content.split(", ")]
+    return content if content is None or isinstance(content, str | int | float) else _plain(content)
+
+
+def _plain(content: Any) -> Any:
+    """A numpy number or array, or another object as text."""
+    return jsonable(content.tolist()) if hasattr(content, "tolist") else str(content)
 
 
 def _text(figure: Figure) -> str:

@@ -107,6 +107,20 @@ def in_markdown(text: object) -> str:
     return re.sub(r"([\\`*\[\]<>|!#~$]|(?<!\w)_|_(?!\w))", r"\\\1", printable(text))
 
 
+def aligned(rows: Sequence[Sequence[str]], *, right: Collection[int] = ()) -> list[str]:
+    """Rows of texts as lines with columns; the last column has no width, and those of `right` end alike."""
+    rows = [[printable(text) for text in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = (
+        "  ".join(
+            text.rjust(width) if c in right else text.ljust(width)
+            for c, (text, width) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in rows
+    )
+    return [line.rstrip() for line in lines]
+
+
 def clipped(text: str, most: int) -> str:
     """A text of at most `most` characters; a longer one ends in "..."."""
     return text if len(text) <= most else text[: most - 3] + "..."

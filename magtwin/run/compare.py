@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.frames import wrap_angle, yaw_from_quat
+from magtwin.report.report import key
 from magtwin.report.summary import Summarized, Summary
 from magtwin.run.figures import UNMODELLED, prediction_nt
 from magtwin.run.run import Run
@@ -112,7 +113,7 @@ class Comparison(Summarized):
             "shift_unit": self.unit,
             "readings": len(self.at),
             "agreements": {
-                a.name: {k: v for k, v in vars(a).items() if k != "name" and v is not None}
+                key(a.name): {k: v for k, v in vars(a).items() if k != "name" and v is not None}
                 for a in self.agreements()
             },
         }

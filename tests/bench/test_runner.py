@@ -224,8 +224,8 @@ def test_the_command_prints_a_line_per_localizer(warm, suite, tmp_path, capsys):
     out = tmp_path / "results"
     main(["bench", str(suite), "--out", str(out), "--only", "exact", "--runs", "2", "--jobs", "1", "--json"])
     made = json.loads(capsys.readouterr().out)
-    assert made["figures"]["runs"]["value"] == 4
-    assert made["figures"]["failed"]["value"] == 2
+    assert made["figures"]["runs"] == 4
+    assert made["figures"]["failed"] == 2
     assert made["metadata"]["localizers"]["exact, bad_localizers:Raises"].startswith("no run finished")
     main(f"bench {suite} --out {out} --shard 5/7 --jobs 1 --only exact --quiet".split())
 

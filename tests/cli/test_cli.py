@@ -26,7 +26,7 @@ def survey(folder):
     return folder
 
 
-def test_a_survey_becomes_a_map_that_info_and_plot_show(tmp_path, capsys, refusal):
+def test_a_survey_becomes_a_map_that_info_and_plot_show(tmp_path, capsys):
     folder = survey(tmp_path / "survey")
     layer, picture = tmp_path / "small.usdc", tmp_path / "small.png"
     main(["map", "import", str(folder), "--out", str(layer), "--licence", "CC0-1.0"])
@@ -35,7 +35,8 @@ def test_a_survey_becomes_a_map_that_info_and_plot_show(tmp_path, capsys, refusa
     capsys.readouterr()
     main(["map", "info", str(layer), "--json"])
     assert "CC0-1.0" in capsys.readouterr().out
-    assert "exists already; give --force" in refusal("map", "import", folder, "--out", layer)
+    main(["map", "import", str(folder), "--out", str(layer)])
+    assert f"{layer} exists: wrote {tmp_path / 'small-1.usdc'}" in capsys.readouterr().out
     main(["map", "import", str(folder), "--out", str(layer), "--force"])
 
 

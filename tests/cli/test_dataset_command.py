@@ -74,7 +74,7 @@ def test_sessions_are_told_by_folder_on_request(recorded, tmp_path, capsys):
     options = ["--map", str(MAP), "--session-by", "folder", "--path-by", "file", "--rate-hz", "5", "--json"]
     main(["dataset", "build", *files, "--out", str(tmp_path / "set"), *options])
     told = json.loads(capsys.readouterr().out)
-    assert told["figures"]["sessions"]["value"] == 2
+    assert told["figures"]["sessions"] == 2
     found = open_dataset(tmp_path / "set")
     assert [one.session for one in found.recordings] == ["monday", "tuesday"]
     assert [one.path for one in found.recordings] == list(found.names)
@@ -120,7 +120,7 @@ def test_info_tells_of_every_recording_and_reads_every_shard(made, capsys):
     told = json.loads(capsys.readouterr().out)
     assert list(told["metadata"]["recordings"]) == ["c", "monday_a", "b", "tuesday_a"]
     assert told["metadata"]["feature sets"] == "full, correlated"
-    assert told["figures"]["labels"]["value"] == 320
+    assert told["figures"]["labels"] == 320
 
 
 @pytest.mark.parametrize(

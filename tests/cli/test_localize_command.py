@@ -148,7 +148,6 @@ def test_a_network_predicts_the_own_field_at_the_poses_of_a_first_pass(here: Pat
         (["--sensor", "white_nt=1e300"], "white_nt of SensorModel must be finite"),
         (["--seed", "-1"], "--seed must be a whole number from 0 up, got -1"),
         (["--odometry", "yaw_std=-1"], "--odometry yaw_std of OdometryModel must be finite and not negative"),
-        (["--out", "run.parquet"], "run.parquet: exists already; give --force"),
     ],
 )
 def test_a_wrong_input_is_refused_in_one_line(

@@ -28,7 +28,7 @@ def test_a_survey_becomes_a_map_that_knows_where_it_comes_from(lab_scene, tmp_pa
     assert field.parameters["readings"] == 135
     assert field.frame == "world: x east, y north, z up"
     assert field.height_m == pytest.approx(0.405, abs=0.002)
-    assert json.loads(capsys.readouterr().out)["figures"]["nodes"]["value"] == 104
+    assert json.loads(capsys.readouterr().out)["figures"]["nodes"] == 104
 
 
 def test_a_survey_of_the_shipped_scene_finds_the_shipped_map_but_for_its_error(lab_scene, tmp_path):

@@ -81,7 +81,7 @@ def test_rates_and_times_left_are_those_of_the_loop(reports, now, said):
 
 def test_an_unknown_length_tells_the_time_that_has_gone(watch, clock, stream):
     clock.now = 5.0
-    watch.step("Drawing the stage")
+    watch.step("Drawing the stage", announced=True)
     clock.now = 7.0
     watch.tick()
     with watch.progress("Recording", "messages") as advance:
@@ -161,3 +161,23 @@ def test_json_stays_json_while_progress_goes_to_stderr(long_run, monkeypatch, ca
     assert re.match(r"  Reading a-long.*( \.\.\.|: [1-9] s so far)\n", error)
     main(["info", str(long_run), "--quiet"])
     assert capsys.readouterr() == ("", "")
+
+
+def test_on_a_terminal_one_line_is_drawn_again_and_disappears(clock, stream, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    watch = Watch(stream=stream, clock=clock, terminal=True)
+    with watch.progress("Driving figure8 with a long name of a path that has no end", "runs") as advance:
+        advance(0, 10)
+        assert stream.getvalue() == ""  # a short step is not drawn
+        clock.now = 1.0
+        advance(5, 10)
+        clock.now = 1.05
+        advance(6, 10)  # too early to draw again
+    watch.clear()
+    drawn = stream.getvalue().split("\r\033[2K")
+    assert drawn[0] == drawn[-1] == ""
+    assert drawn[1] == "  [##########..........] Driving figure8 with a long name of a"[:59]
+    assert len(drawn) == 3
+    watch.announces = True
+    watch.step("simulating", announced=True)
+    assert stream.getvalue().endswith("  simulating ...\n")

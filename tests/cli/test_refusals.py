@@ -28,9 +28,7 @@ REFUSALS = [
     ("run lab --network gone.pth --out new", "no such"),
     # outputs
     ("convert run.npz page.html/new.csv", "page.html/new.csv: cannot be written"),
-    ("convert run.npz path.csv", "path.csv: exists already; give --force"),
-    ("robot robot.urdf --out set", "set: exists already; give --force"),
-    ("sweep lab --out set", "--force"),
+    ("robot robot.urdf --out new.usdc", "new.usdc: a robot is a folder or one .usda; give new, or new.usda"),
     ("run lab --out new.json", "new.json: a released package is read, not written"),
     ("convert run.npz new.json", "is read, not written"),
     ("run lab --out new.txt", "unknown format of a run"),
@@ -89,7 +87,6 @@ REFUSALS = [
     ("map survey lab --seed -1 --out new.usdc", "seed must be a whole number from 0 up"),
     ("map survey lab --height-m nan --out new.usdc", "--height-m must be a height above the floor"),
     ("map survey lab --position-error-m -1 --out new.usdc", "--position-error-m must not be below 0"),
-    ("map survey lab --out map.usdc", "exists already; give --force"),
     ("map survey lab --out new.csv", "ends in .usdc"),
     ("new random.py", "random"),
     ("new my-filter.py", "my-filter"),

@@ -183,7 +183,7 @@ def kinds(data, tmp_path_factory):
 def test_what_is_told_of_a_kind_is_its_own_error_beside_the_naive_and_the_ridges(data, kinds, kind):
     out, printed = kinds[kind]
     predictor, figures = load_predictor(out), printed["figures"]
-    assert figures["kind"]["value"] == predictor.kind == kind
+    assert figures["kind"] == predictor.kind == kind
     errors, naive, inside, ridge = [], [], [], []
     peer = load_predictor(kinds["linear"][0])  # on the set "circular", as the baseline
     for _, run in open_dataset(data).runs(["f", "g"]):
@@ -192,10 +192,10 @@ def test_what_is_told_of_a_kind_is_its_own_error_beside_the_naive_and_the_ridges
         inside.append(errors[-1] <= 1.645 * sd)
         naive.append(np.abs(predictor.metadata["label_mean_nt"] - run["label_nt"]))
         ridge.append(np.abs(peer.predict(features(run, peer.features))[0] - run["label_nt"]))
-    assert figures["test MAE"]["value"] == pytest.approx(np.mean(errors))
-    assert figures["test naive MAE"]["value"] == pytest.approx(np.mean(naive))
-    assert figures["test ridge MAE"]["value"] == pytest.approx(np.mean(ridge))
-    assert figures["test coverage"]["value"] == pytest.approx(np.mean(inside), abs=0.003)
+    assert figures["test_mae_nt"] == pytest.approx(np.mean(errors))
+    assert figures["test_naive_mae_nt"] == pytest.approx(np.mean(naive))
+    assert figures["test_ridge_mae_nt"] == pytest.approx(np.mean(ridge))
+    assert figures["test_coverage"] == pytest.approx(np.mean(inside), abs=0.003)
     assert np.mean(errors) < 0.8 * np.mean(naive)
     row = f"{np.mean(errors) / np.mean(naive):.3f} | {np.mean(ridge):.1f} |"
     assert row in out.with_suffix(".md").read_text()
@@ -245,7 +245,8 @@ def test_what_cannot_be_trained_is_refused_and_writes_nothing(data, kinds, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
-def test_files_beside_the_weights_are_not_written_over(data, tmp_path, refusal):
+def test_files_beside_the_weights_are_not_written_over(data, tmp_path, tiny, capsys):
     (tmp_path / "f.png").write_text("mine")
-    said = refusal("train", data, "--out", tmp_path / "f.safetensors")
-    assert "f.png: exists already; give --force" in said
+    main(["train", str(data), *tiny, "--out", str(tmp_path / "f.safetensors")])
+    assert f"exists: wrote {tmp_path / 'f-1.safetensors'}" in capsys.readouterr().out
+    assert sorted(p.name for p in tmp_path.glob("f*")) == ["f-1.md", "f-1.png", "f-1.safetensors", "f.png"]

@@ -8,7 +8,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 
 from magtwin.errors import InputError
-from magtwin.fetch import SOURCES, Source, fetch
+from magtwin.fetch import SOURCES, Source, fetch, is_complete
 
 
 class Quiet(SimpleHTTPRequestHandler):
@@ -51,6 +51,9 @@ def test_files_come_whole_from_the_base_url(mirror, table, tmp_path):
     files = fetch("tiny", tmp_path / "out", base_url=url, progress=lambda *step: seen.append(step))
     assert [f.read_bytes() for f in files] == [b"alpha", b"beta"]
     assert seen == [(0, 2, "a"), (1, 2, "b"), (2, 2, "")]
+    assert is_complete("tiny", tmp_path / "out")
+    files[0].write_bytes(b"alpho")
+    assert not is_complete("tiny", tmp_path / "out")
 
 
 @pytest.mark.parametrize(("served", "words"), [(b"something else", "SHA-256 is not"), (None, "404")])

@@ -170,7 +170,6 @@ def test_convert_takes_frames_a_second_units_and_the_scene(run, written, lab_sce
 @pytest.mark.parametrize(
     ("source", "out", "options", "message"),
     [
-        ("run.parquet", "run.csv", [], "run.csv: exists already; give --force"),
         ("run.parquet", "new.xyz", [], "unknown format of a run; known: .csv"),
         ("run.parquet", "new.csv", ["--out-unit", "nT"], "CSV has no option 'units'; drop it"),
         ("run.parquet", "new.csv", ["--scene", "x.usda"], "a table shows no scene; drop --scene"),
@@ -192,8 +191,8 @@ def test_what_convert_cannot_do_is_refused_in_one_line(source, out, options, mes
 def test_info_of_every_format_tells_rows_columns_units_and_what_the_run_came_from(name, run, written, capsys):
     main(["info", str(written / name), "--json"])
     told = json.loads(capsys.readouterr().out)
-    assert told["figures"]["readings"]["value"] == run.rows
-    assert told["figures"]["columns"]["value"] == len(run)
+    assert told["figures"]["readings"] == run.rows
+    assert told["figures"]["columns"] == len(run)
     assert told["metadata"]["columns"]["b_total_nt"].startswith("nT  b_map_nt + b_disturbance_nt")
     for fact in ("seed", "scene_sha256", "map_sha256", "magtwin", "path"):
         assert told["metadata"][fact] == run.metadata[fact]

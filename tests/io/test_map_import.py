@@ -27,8 +27,8 @@ def test_latched_nodes_leave_the_layers_valid_ones_and_can_be_kept(tmp_path, cap
     run("map", "import", maps, "--out", tmp_path / "a.usdc", "--licence", "MIT", "--json")
     report = json.loads(capsys.readouterr().out)
     field = load_map(tmp_path / "a.usdc")
-    assert report["figures"]["stuck at every heading"]["value"] == 17
-    assert report["figures"]["masked nodes"]["value"] == np.count_nonzero(~field.valid) > 68
+    assert report["figures"]["stuck_at_every_heading_nodes"] == 17
+    assert report["figures"]["masked_nodes"] == np.count_nonzero(~field.valid) > 68
     assert np.isnan(field.lookup([-1.25, 0.75], 0.0))
     assert_array_equal(field.valid, open_map(maps).valid)
     run("map", "import", maps, "--out", tmp_path / "b.usdc", "--keep-stuck", "--json")
@@ -36,7 +36,7 @@ def test_latched_nodes_leave_the_layers_valid_ones_and_can_be_kept(tmp_path, cap
     assert whole.valid.all()
     assert whole.lookup([-1.25, 0.75], 0.0) == pytest.approx(35_602.1, abs=0.1)
     report = json.loads(capsys.readouterr().out)
-    assert report["figures"]["stuck at every heading"]["value"] == 17
+    assert report["figures"]["stuck_at_every_heading_nodes"] == 17
 
 
 def test_readings_kept_as_parquet_make_the_same_layer_as_the_folder_and_keep_what_was_said(
@@ -59,7 +59,7 @@ def test_readings_kept_as_parquet_make_the_same_layer_as_the_folder_and_keep_wha
         assert field.height_m == pytest.approx(0.35)
     run("map", "validate", tmp_path / "a.parquet", "--method", "trilinear", "--json")
     report = json.loads(capsys.readouterr().out)
-    assert report["figures"]["readings predicted"]["value"] == np.count_nonzero(fields[0].valid)
+    assert report["figures"]["readings_predicted"] == np.count_nonzero(fields[0].valid)
 
 
 def test_a_table_becomes_a_file_of_readings_by_its_column_names(tmp_path, capsys):
@@ -68,7 +68,7 @@ def test_a_table_becomes_a_file_of_readings_by_its_column_names(tmp_path, capsys
     columns += ["--field", "b", "--unit", "uT"]
     run("map", "import", tmp_path / "a.csv", "--out", tmp_path / "a.parquet", *columns, "--json")
     figures = json.loads(capsys.readouterr().out)["figures"]
-    assert figures["readings"]["value"] == 2
+    assert figures["readings"] == 2
     readings = load_readings(tmp_path / "a.parquet")
     assert_array_equal(readings.b_nt, [41_000, 42_000])
     assert_allclose(readings.yaw, np.radians([10, 20]))

@@ -141,8 +141,8 @@ def test_a_run_of_a_data_set_comes_out_again_in_its_session(lab_scene, tmp_path,
     capsys.readouterr()
     main(["reproduce", str(out / "run_00002.parquet"), "--json"])
     figures = json.loads(capsys.readouterr().out)["figures"]
-    assert figures["equal"]["value"] == "yes, to the bit"
-    assert figures["equal columns"]["value"] == 4
+    assert figures["equal"] == "yes, to the bit"
+    assert figures["equal_columns"] == 4
     a, b = (read_parquet(out / f"run_0000{k}.parquet").metadata["config_sha256"] for k in (0, 2))
     assert a != b
 

@@ -5,7 +5,9 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path as FilePath
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from waiting import PATIENCE_S, wait_until
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.frames import rotate
-from magtwin.io.rerun import recording
+from magtwin.io.rerun import recording, viewer
 from magtwin.io.rerun.file import read_run, read_runs, show_run, write_comparison, write_rrd
 from magtwin.io.rerun.series import STATES
 from magtwin.io.rerun.viewer import live_viewer, screenshot, show
@@ -366,3 +368,27 @@ def test_metadata_in_the_viewer_are_text_and_no_markdown():
     (text,) = page.text.as_arrow_array().to_pylist()
     cell = text.splitlines()[2]
     assert cell == r"| scene | \!\[x\](http://a.example/t.png) \<b\> \\u202e\\x1b a\\\|b \| c |"
+
+
+def test_a_viewer_that_lives_is_waited_for_and_a_command_is_sent_once(monkeypatch):
+    monkeypatch.setattr(viewer, "LATE_S", 0.05)
+    sent, ended = [], [None]
+
+    def ask(name, late):
+        sent.append(name)
+        if late and sent.count(name) < 3:
+            time.sleep(late)
+            raise RuntimeError("deadline has elapsed")
+        return name
+
+    names = ("take_screenshot", "run_command", "get_state", "open", "save_screenshot")
+    slow = SimpleNamespace(**{name: lambda late=0.0, name=name: ask(name, late) for name in names})
+    client = viewer._Patient(slow, SimpleNamespace(poll=lambda: ended[0]))
+    assert client.take_screenshot(0.06) == "take_screenshot"
+    assert client.run_command(0.06) == "get_state"
+    assert sent == ["take_screenshot"] * 3 + ["run_command", "get_state"]
+    with pytest.raises(RuntimeError):
+        client.open(0.01)  # it came at once
+    ended[0] = 1
+    with pytest.raises(RuntimeError):
+        client.save_screenshot(0.06)

@@ -36,8 +36,9 @@ def dead_reckoning(run, start):
 def test_every_number_of_the_report_is_that_of_the_raw_arrays(run, prior):
     made = localization(run, "lab", prior=prior)
     printed = json.loads(made.report().to_json())
-    shown = {name: figure["value"] for name, figure in printed["figures"].items()}
-    notes = {name: figure.get("note", "") for name, figure in printed["figures"].items()}
+    figures = made.report().figures
+    shown = {figure.name: figure.value for figure in figures}
+    notes = {figure.name: figure.note for figure in figures}
     got = made.run
     t, known = got["t"], ~got["flag_pose_lost"]
     off = (got["est_p_world_base"] - got["p_world_base"])[:, :2]

@@ -340,14 +340,19 @@ def test_a_joint_without_a_limit_turns_on_and_on(tmp_path, limit):
 
 def test_the_command_converts_both_ways_and_lists_what_is_left_out(tmp_path, capfd):
     out = tmp_path / "back.urdf"
-    main(["robot", str(shipped("robots", "turtlebot4", "turtlebot4.usda")), "--out", str(out), "--json"])
+    words = ["robot", str(shipped("robots", "turtlebot4", "turtlebot4.usda")), "--out", str(out)]
+    main([*words, "--json"])
     said = json.loads(capfd.readouterr().out)
-    assert said["figures"]["links"]["value"] == len(read_description(out).links)
+    assert said["figures"]["links"] == len(read_description(out).links)
     assert "MagtwinMagnetometerAPI" in said["metadata"]["notes"][0]
-    for words, message in (
-        (["--out", str(out), "--fix-base"], "without other options than --force"),
-        (["--out", str(out)], "exists already"),
-    ):
-        with pytest.raises(SystemExit):
-            main(["robot", str(shipped("robots", "turtlebot4", "turtlebot4.usda")), *words])
-        assert message in capfd.readouterr().err
+    with pytest.raises(SystemExit):
+        main(
+            [
+                "robot",
+                str(shipped("robots", "turtlebot4", "turtlebot4.usda")),
+                "--out",
+                str(out),
+                "--fix-base",
+            ]
+        )
+    assert "without other options than --force" in capfd.readouterr().err

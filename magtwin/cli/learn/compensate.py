@@ -7,7 +7,7 @@ from cyclopts import App
 
 from magtwin.cli.learn.model import model_app
 from magtwin.cli.options import Flag, Force
-from magtwin.cli.terminal import Done, check_output, step
+from magtwin.cli.terminal import Done, named, step
 from magtwin.files.kinds import expected
 
 compensate_app = App(name="compensate", help="Remove the platform's field from a run (Tolles-Lawson).")
@@ -53,7 +53,7 @@ def fit(
     from magtwin.io.tables import read_parquet
     from magtwin.learn.compensation.tolles_lawson import fit_run
 
-    check_output(out, (".json",), "a Tolles-Lawson model", force=force)
+    out = named(out, (".json",), "a Tolles-Lawson model", force=force)
     names = tuple(name.strip() for name in terms.split(",") if name.strip())
     step("Fitting the model")
     model = fit_run(
@@ -84,9 +84,9 @@ def apply(run: Path, model: Path, *, out: Path, force: Force = False) -> Done:
     from magtwin.io.tables import read_parquet, write_parquet
     from magtwin.learn.compensation.tolles_lawson import TollesLawson, compensate_run
 
-    check_output(out, (".parquet",), "a run", force=force)
+    out = named(out, (".parquet",), "a run", force=force)
     compensated, report = compensate_run(
         read_parquet(expected(run, "run")), TollesLawson.load(expected(model, "Tolles-Lawson model"))
     )
     write_parquet(compensated, out, force=force)
-    return Done(report, out)
+    return Done(report, out, next=(("magtwin", "report", out),))

@@ -62,11 +62,10 @@ def build(
     jobs
         Number of processes that share the recordings. Default: one, with several threads.
     """
-    from magtwin.files.outputs import check_free
+    from magtwin.files.outputs import free
     from magtwin.learn.data.alignment import Alignment
     from magtwin.tasks.learning import build_dataset
 
-    check_free(out, force=force)
     given = lever_arm_m is not None or latency_s is not None
     if given and alignment == "fit":
         raise InputError("--alignment fit finds both; drop it, or --lever-arm-m and --latency-s")
@@ -75,6 +74,7 @@ def build(
     if len(set(columns.values())) < len(columns):
         raise InputError(f"--column names one column twice, got {' '.join(column or ())}")
     reading = recorded.options | ({"columns": columns} if columns else {})
+    (out,) = free(out, force=force)
     with progress("Labelling", "recordings") as advance:
         made = build_dataset(
             run,
@@ -89,7 +89,8 @@ def build(
             progress=advance,
             **reading,
         )
-    return Done(made.report(), out)
+    train = ("magtwin", "train", out, "--out", f"{out.name}.safetensors")
+    return Done(made.report(), out, next=(train, ("magtwin", "dataset", "info", out)))
 
 
 @dataset_app.command
@@ -114,4 +115,4 @@ def info(dataset: Path) -> Done:
         f"labels, {each.label_mean_nt:.0f} ± {each.label_sd_nt:.0f} nT"
         for each in opened.recordings
     }
-    return Done(replace(report, metadata={**report.metadata, "recordings": recordings}))
+    return Done(replace(report, metadata={**report.metadata, "recordings": recordings}), whole=True)

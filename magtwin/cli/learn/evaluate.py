@@ -8,8 +8,9 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Flag, Force, Names, Seed, pairs
-from magtwin.cli.terminal import Done, progress, stdout_console, step
+from magtwin.cli.terminal import Done, progress, step, width
 from magtwin.errors import InputError
+from magtwin.report.summary import aligned, clipped
 
 if TYPE_CHECKING:
     from magtwin.learn.evaluation.evaluation import Evaluation
@@ -77,12 +78,11 @@ def evaluate(
 
     from magtwin.figures.evaluations import NAME, page_of_evaluation
     from magtwin.figures.page import to_json, write_pages
-    from magtwin.files.outputs import check_free
+    from magtwin.files.outputs import free
     from magtwin.learn.evaluation.evaluation import TOTALS
     from magtwin.tasks.learning import error_budget, map_of_scene
     from magtwin.tasks.learning import evaluate as evaluate_models
 
-    check_free(out, force=force)
     if scene is not None and map and train is None:
         raise InputError(
             "--scene adds an error budget, for which --train is needed too; give it, or no --scene"
@@ -92,6 +92,7 @@ def evaluate(
     cases = pairs("case", case, "a row of the table and its path, such as D=lawnmower.csv")
     if taken := cases.keys() & set(TOTALS):
         raise InputError(f"--case {min(taken)} is a row of the table already; take another name")
+    (out,) = free(out, force=force)
     step("Reading maps, weights and recordings")
     with progress("Judging", "recordings") as advance:
         evaluation = evaluate_models(
@@ -113,8 +114,14 @@ def evaluate(
     step("Writing the report")
     page = page_of_evaluation(evaluation, budgets=budgets, both=both)
     write_pages(page, out, NAME, force=force)
-    written = f"Wrote {out}: evaluation.html, evaluation.json"
-    return Done(table=lambda: _print(evaluation), text=written, data=loads(to_json(page)))
+    html = out / f"{NAME}.html"
+    return Done(
+        lines=_lines(evaluation),
+        wrote=(html, html.with_suffix(".json")),
+        data=loads(to_json(page)),
+        rest=str(html),
+        next=[("magtwin", "info", weights[0])],
+    )
 
 
 def _overlaid(evaluation: "Evaluation", overlay: Path) -> "tuple[Traversals, tuple[str, str]]":
@@ -128,30 +135,21 @@ def _overlaid(evaluation: "Evaluation", overlay: Path) -> "tuple[Traversals, tup
     return traversals(first.run, other), (first.name, name)
 
 
-def _print(evaluation: "Evaluation") -> None:
-    """Print Table 1: for each model its error, and the ratio to the naive error by path."""
-    from rich.table import Table
-    from rich.text import Text
-
-    console = stdout_console()
-    most = MOST_CASES if console.is_terminal else len(evaluation.cases)
-    shown = [
-        *evaluation.cases[:most],
-        *(case for case in evaluation.cases[most:] if case is evaluation.every),
-    ]
-    table = Table(box=None, pad_edge=False)
-    table.add_column("ratio to naive", overflow="fold")
-    for column in (*(case.name for case in shown), "MAE", "90 %"):
-        table.add_column(Text(column), justify="right", overflow="fold", min_width=4)
-    for m, name in enumerate(evaluation.names):
-        score = evaluation.every.scores[m]
-        covered = "" if math.isnan(score.coverage) else f"{score.coverage:.0%}"
-        ratios = [f"{case.scores[m].ratio:.3f}" for case in shown]
-        table.add_row(*map(Text, (name, *ratios, f"{score.mae_nt:.0f} nT", covered)))
-    readings = evaluation.every.scores[0].rows
-    console.print(Text(f"{readings:,} readings of {len(evaluation.judged)} recordings", style="bold"))
-    console.print(table)
-    for name, line in evaluation.verdicts().items():
-        console.print(Text(f"{name}: {line}", style="bold"), soft_wrap=True)
-    for reason, count in evaluation.left_out.items():
-        console.print(Text(f"left out: {count:,} readings that {reason}", style="dim"))
+def _lines(evaluation: "Evaluation") -> list[str]:
+    """Verdicts, and Table 1: for each model the ratio to the naive error by path, its error and coverage."""
+    lines = [f"{name}: {line}" for name, line in evaluation.verdicts().items()]
+    lines.append(f"{evaluation.every.scores[0].rows:,} readings of {len(evaluation.judged)} recordings")
+    room, table = width() or 100, list[str]()
+    for most in range(MOST_CASES, -1, -1):  # as many paths as are not wider than the terminal
+        shown = [case for case in evaluation.cases[:most] if case is not evaluation.every]
+        rows = [("ratio to naive", *(case.name for case in (*shown, evaluation.every)), "MAE", "90 %")]
+        for m, name in enumerate(evaluation.names):
+            score = evaluation.every.scores[m]
+            covered = "" if math.isnan(score.coverage) else f"{score.coverage:.0%}"
+            ratios = [f"{case.scores[m].ratio:.3f}" for case in (*shown, evaluation.every)]
+            rows.append((clipped(name, 40), *ratios, f"{score.mae_nt:.0f} nT", covered))
+        table = aligned(rows, right=range(1, len(rows[0])))
+        if max(map(len, table)) <= room:
+            break
+    left = [f"left out: {count:,} readings that {reason}" for reason, count in evaluation.left_out.items()]
+    return [*lines, *left, *table]

@@ -7,7 +7,7 @@ from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Flag, Force, Licence
-from magtwin.cli.terminal import Done, check_output, step
+from magtwin.cli.terminal import Done, named, step
 
 model_app = App(name="model", help="Convert, export and calibrate networks; compensate the platform's field.")
 app.command(model_app)
@@ -28,10 +28,10 @@ def convert(pth: Path, *, out: Path, licence: Licence = "", force: Force = False
     """
     from magtwin.learn.models.network import convert as convert_file
 
-    check_output(out, (".safetensors",), "a network", force=force)
+    out = named(out, (".safetensors",), "a network", force=force)
     step("Reading the checkpoint")
     net = convert_file(pth, out, licence=licence, force=force)
-    return Done(net.report(str(out)), out)
+    return Done(net.report(str(out)), out, rest=f"magtwin info {out}")
 
 
 @model_app.command
@@ -51,10 +51,10 @@ def export(weights: Path, *, out: Path, force: Force = False) -> Done:
     """
     from magtwin.learn.inference.onnx import export_onnx
 
-    check_output(out, (".onnx",), "an ONNX file", force=force)
+    out = named(out, (".onnx",), "an ONNX file", force=force)
     step("Exporting the network")
     report = export_onnx(weights, out, force=force)
-    return Done(report, out)
+    return Done(report, out, rest=f"magtwin info {out}")
 
 
 @model_app.command
@@ -84,9 +84,10 @@ def widen(
     """
     from magtwin.tasks.learning import widen as widen_file
 
-    check_output(out, (".safetensors",), "a network", force=force)
+    out = named(out, (".safetensors",), "a network", beside=(".md",), force=force)
     step("Reading the recordings")
-    return Done(widen_file(weights, runs, anomaly_map=map, out=out, force=force).report(str(out)), out)
+    report = widen_file(weights, runs, anomaly_map=map, out=out, force=force).report(str(out))
+    return Done(report, out, rest=f"magtwin info {out}")
 
 
 @model_app.command
@@ -125,9 +126,9 @@ def calibrate(
     """
     from magtwin.tasks.learning import calibrate as calibrate_files
 
-    check_output(out, (".safetensors",), "a network", force=force)
-    step("Calibrating")
+    out = named(out, (".safetensors",), "a network", force=force)
+    step("Calibrating on the drive")
     poses: Any = {"pose_sd_m": pose_sd_m, "pose_from_map": pose_from_map}
     options: Any = {"anomaly_map": map, "duration_s": duration_s, "out": out, "force": force}
     calibrated = calibrate_files(weights, run, **poses, **options)
-    return Done(calibrated.report(str(out)), out)
+    return Done(calibrated.report(str(out)), out, rest=f"magtwin info {out}")

@@ -76,7 +76,7 @@ def train(
 
     from magtwin.figures.canvas import save
     from magtwin.figures.training import draw_learning_curve
-    from magtwin.files.outputs import check_free, transaction
+    from magtwin.files.outputs import free, transaction
     from magtwin.learn.training.config import TrainConfig, read_config
     from magtwin.learn.training.train import train as train_model
 
@@ -88,9 +88,8 @@ def train(
     base = TrainConfig() if config is None else read_config(config)
     names = [field.name for field in fields(base) if given.get(field.name) is not None]
     options = base.with_options(**{name: given[name] for name in names})
-    picture = out.with_suffix(".png")
-    if options.epochs is not None:
-        check_free(picture, force=force)
+    beside = (".md",) if options.epochs is None else (".md", ".png")
+    (out,) = free(out, beside=beside, force=force)
     with transaction():
         with progress("Training", "rows") as show:
             pace = _Pace(show, options.epochs)
@@ -99,11 +98,12 @@ def train(
             )
         if result.history:
             naive = result.parts[0].naive_rmse_nt
-            save(
-                draw_learning_curve(result.history, naive_rmse_nt=naive, title=out.name), picture, force=force
-            )
-    shown = [picture.name] if result.history else []
-    return Done(result.report(str(out)), (out, out.with_suffix(".md").name, *shown))
+            curve = draw_learning_curve(result.history, naive_rmse_nt=naive, title=out.name)
+            save(curve, out.with_suffix(".png"), force=force)
+    wrote = [out.with_suffix(ending) for ending in beside[: 1 + bool(result.history)]]
+    figures = [f"test {name}" for name in ("MAE", "naive MAE", "ratio", "coverage")]
+    export = ("magtwin", "model", "export", out, "--out", out.with_suffix(".onnx"))
+    return Done(result.report(str(out)), (out, *wrote), figures, rest=f"magtwin info {out}", next=(export,))
 
 
 class _Pace:

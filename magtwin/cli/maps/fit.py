@@ -1,11 +1,10 @@
 """`magtwin map import`, `fit`, `validate` and `survey`: surveys to maps."""
 
-import json
 import re
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -13,7 +12,7 @@ from cyclopts import Parameter
 
 from magtwin.cli.maps.map import LAYERS, Earth, Kernel, Sources, earth_nt, map_app
 from magtwin.cli.options import Flag, Force, Jobs, Lab, Licence, Seed, Whole, headings_rad
-from magtwin.cli.terminal import Done, check_output, progress
+from magtwin.cli.terminal import Done, named, progress
 from magtwin.errors import InputError
 from magtwin.io.surveys.columns import About, Columns
 from magtwin.report.report import Report
@@ -95,7 +94,7 @@ def map_import(
     from magtwin.io.surveys.maps import import_survey
 
     out = out or Path(f"{Path(sources[0]).stem}.usdc")
-    check_output(out, (*LAYERS, ".parquet"), "a map layer, or a file of readings,", force=force)
+    out = named(out, (*LAYERS, ".parquet"), "a map layer, or a file of readings,", force=force)
     with progress("Reading the survey") as advance:
         report = import_survey(sources, out, about=about, progress=advance, force=force, **vars(reading))
     return _done(report, out)
@@ -135,9 +134,9 @@ def map_fit(
     """
     from magtwin.io.surveys.maps import fit_survey
 
-    check_output(out, LAYERS, "a map layer", force=force)
+    out = named(out, LAYERS, "a map layer", force=force)
     angles = None if headings_deg is None else headings_rad(headings_deg)
-    work = "Fitting" if method == "auto" else f"Fitting {method}"
+    work = "Choosing the method of the map" if method == "auto" else f"Fitting the {method} map"
     with _as_imported(sources), progress(work) as advance:
         report = fit_survey(
             sources,
@@ -155,15 +154,12 @@ def map_fit(
 
 
 def _done(report: Report, out: Path) -> Done:
-    """A report on a survey, with its outliers in one line; JSON lists them."""
-    outliers = report.metadata.get("outliers", ())
-    if not outliers:
-        return Done(report, out)
-    note = f"left in; the largest: {outliers[0]}; --json lists {len(outliers)}"
-    figures = tuple(replace(f, note=note) if f.name == "outliers" else f for f in report.figures)
-    shown = {name: value for name, value in report.metadata.items() if name != "outliers"}
-    brief = replace(report, figures=figures, metadata=shown)
-    return Done(brief, out, data=json.loads(report.to_json()))
+    """A report on a survey or its map, and what to do with it."""
+    rest = f"magtwin info {out}"
+    look: list[tuple[object, ...]] = [("magtwin", "plot", out)]
+    if out.suffix.lower() == ".parquet":
+        rest, look = "", [("magtwin", "map", "fit", out, "--out", out.with_suffix(".usdc"))]
+    return Done(report, out, rest=rest, next=look)
 
 
 @map_app.command(name="validate")
@@ -189,7 +185,7 @@ def map_validate(
     """
     from magtwin.io.surveys.maps import validate_methods
 
-    with _as_imported(sources), progress("Validating") as advance:
+    with _as_imported(sources), progress("Predicting the readings left out") as advance:
         report = validate_methods(
             sources,
             methods=method,
@@ -199,7 +195,8 @@ def map_validate(
             keep_stuck=keep_stuck,
             progress=advance,
         )
-    return Done(report)
+    best = ("magtwin", "map", "fit", *sources, "--out", "map.usdc")
+    return Done(report, next=(best,))
 
 
 @map_app.command(name="survey")
@@ -261,7 +258,7 @@ def map_survey(
     from magtwin.twin.maps import survey_scene
 
     scene = scene_file(scene)
-    check_output(out, (*LAYERS, ".parquet"), "a map layer, or a file of readings,", force=force)
+    out = named(out, (*LAYERS, ".parquet"), "a map layer, or a file of readings,", force=force)
     angles = headings_rad(headings_deg)
     with progress(f"Surveying {scene.name}", "headings") as advance:
         report = survey_scene(
@@ -283,4 +280,4 @@ def map_survey(
             progress=advance,
             force=force,
         )
-    return Done(report, out)
+    return _done(report, out)

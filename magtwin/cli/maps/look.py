@@ -1,5 +1,6 @@
 """`magtwin map info`, `diff`, `upward`, `export` and `occupancy`: commands on what exists."""
 
+import json
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +9,7 @@ from cyclopts import Parameter
 
 from magtwin.cli.maps.map import LAYERS, PICTURES, MapFile, map_app
 from magtwin.cli.options import Force
-from magtwin.cli.terminal import Done, check_output, print_report, step
+from magtwin.cli.terminal import Done, named, step
 
 
 @map_app.command(name="info")
@@ -17,7 +18,7 @@ def map_info(file: MapFile) -> Done:
     from magtwin.field.maps.statistics import map_metadata
     from magtwin.io.map_files import open_map
 
-    return Done(map_metadata(open_map(file)))
+    return Done(map_metadata(open_map(file)), whole=True)
 
 
 @map_app.command(name="diff")
@@ -36,7 +37,7 @@ def map_diff(before: Path, after: Path, *, out: Path | None = None, force: Force
     from magtwin.field.maps.difference import difference
     from magtwin.io.map_files import open_map
 
-    check_output(out, PICTURES, "a picture", force=force)
+    out = out and named(out, PICTURES, "a picture", force=force)
     step("Comparing the maps")
     change = difference(open_map(before), open_map(after))
     if out is not None:
@@ -47,7 +48,8 @@ def map_diff(before: Path, after: Path, *, out: Path | None = None, force: Force
     report = change.report()
     regions = [asdict(region) for region in change.regions]
     whole = replace(report, metadata={**report.metadata, "regions": regions})
-    return Done(whole, out or (), table=lambda: print_report(report))
+    draw = ("magtwin", "plot", before, after, "--out", "difference.png")
+    return Done(report, out or (), data=json.loads(whole.to_json()), next=() if out else (draw,))
 
 
 @map_app.command(name="upward")
@@ -70,11 +72,11 @@ def map_upward(
     from magtwin.io.map_files import open_map
     from magtwin.usd.maps.layer import save_map
 
-    check_output(out, LAYERS, "a map layer", force=force)
+    out = named(out, LAYERS, "a map layer", force=force)
     step(f"Continuing the field to {height_m:g} m")
     field = at_height(open_map(file), height_m)
     save_map(field, out, force=force)
-    return Done(map_metadata(field), out)
+    return Done(map_metadata(field), out, rest=f"magtwin info {out}", next=(("magtwin", "plot", out),))
 
 
 @map_app.command(name="export")
@@ -90,9 +92,13 @@ def map_export(file: MapFile, *, out: Path, force: Force = False) -> Done:
         Folder to make: 0_map.csv, 90_map.csv, ..., rows of x [m], y [m], heading [rad], field [nT].
     """
     from magtwin.field.survey.nodes import write_survey
+    from magtwin.files.outputs import free
     from magtwin.io.map_files import open_map
 
-    return Done(wrote=tuple(write_survey(open_map(file), out, force=force)))
+    (out,) = free(out, force=force)
+    files = write_survey(open_map(file), out, force=force)
+    again = ("magtwin", "map", "import", out, "--out", f"{out.name}.usdc")
+    return Done(wrote=tuple(files), next=(again,))
 
 
 @map_app.command(name="occupancy")
@@ -113,7 +119,7 @@ def map_occupancy(scene: Path, *, out: Path, resolution_m: float | None = None, 
     from magtwin.path.occupancy import occupancy_of
     from magtwin.twin import open_twin, room_of
 
-    check_output(out, (".yaml",), "a map of map_server", force=force)
+    out = named(out, (".yaml",), "a map of map_server", beside=(".pgm",), force=force)
     step("Opening the scene")
     grid = occupancy_of(room_of(open_twin(scene, magnetometer="map-only")), resolution_m=resolution_m)
     wrote = grid.save(out, force=force)
@@ -124,5 +130,4 @@ def map_occupancy(scene: Path, *, out: Path, resolution_m: float | None = None, 
         "resolution_m": grid.resolution_m,
         "origin_m": list(grid.origin_m),
     }
-    lines = (str(grid), f"Wrote {wrote[0]} and {wrote[1]}")
-    return Done(text="\n".join(lines), data=data, wrote=wrote)
+    return Done(lines=str(grid).splitlines(), data=data, wrote=wrote)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force, Gamepad, Lab, MapLayer, Network, Plant, Seed, Session
-from magtwin.cli.runs.run import save_picture
-from magtwin.cli.terminal import Done, announce, note, silence
+from magtwin.cli.runs.run import SHOWN, save_picture
+from magtwin.cli.terminal import Done, note, silence, step
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def drive(
 
     from magtwin.files.file import existing
     from magtwin.files.kinds import scene_file
-    from magtwin.files.outputs import output
+    from magtwin.files.outputs import free, output
     from magtwin.io.outputs import Outputs
     from magtwin.io.outputs import drive as drive_again
     from magtwin.sim.motion.closed_loop import Chassis
@@ -72,6 +72,7 @@ def drive(
         if existing(gamepad, "gamepad").is_dir():
             raise InputError(f"{gamepad}: a folder; name a gamepad in it, such as /dev/input/js0")
         raise InputError(f"{gamepad}: not a gamepad; name one, such as /dev/input/js0")
+    (out,) = free(out, force=force)
     with output(out, force=force) as folder:
         twin = open_twin(scene, lab=lab, map_layer=map_layer, network=network)
         twin = with_plant(twin, plant)
@@ -108,13 +109,21 @@ def drive(
             session=session,
             plant=plant,
             metadata={"commands_file": "commands.csv"},
-            report=announce,
+            report=step,
+            tell=note,
         )
         Outputs(folder, picture=save_picture).write(driven)
-    again = f"magtwin run {scene} --path {out / 'commands.csv'} --seed {seed}"
+    again: list[object] = ["magtwin", "run", scene, "--path", out / "commands.csv", "--seed", seed]
     options = {"lab": lab or None, "map": map_layer, "session": session, "plant": plant}
-    again += "".join(f" --{name} {value}" for name, value in options.items() if value is not None)
-    return Done(driven.run.report(f"Manual drive in {scene}"), out, text=f"Wrote {out}; again: {again}")
+    again += [word for name, value in options.items() if value is not None for word in (f"--{name}", value)]
+    following = (("magtwin", "view", out / "run.rrd"), again)
+    return Done(
+        driven.run.report(f"Manual drive in {scene.stem}"),
+        out,
+        SHOWN,
+        rest=f"magtwin info {out}",
+        next=following,
+    )
 
 
 def _drive(recorder: "Recorder", hand: "Hand", device: int, dt: float, show: object) -> None:

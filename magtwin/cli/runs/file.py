@@ -24,7 +24,7 @@ def info(file: Path, *, recorded: RecordedOptions = RECORDED) -> Done:
     from magtwin.io.info import info_of
 
     step(f"Reading {file.name}")
-    return Done(info_of(file, **recorded.options))
+    return Done(info_of(file, **recorded.options), whole=True)
 
 
 @app.command
@@ -70,8 +70,10 @@ def convert(
         File to make: .parquet, .csv, .npz, .rrd, .mcap, .usd, .usda or .usdc. A name without a suffix is the
         folder of a rosbag2.
     """
+    from magtwin.files.outputs import free
     from magtwin.io.convert import convert_run
 
+    (out,) = free(out, force=force)
     step("Converting the run")
     result = convert_run(
         run,
@@ -84,7 +86,8 @@ def convert(
     )
     rows = f"{result.rows:,} rows, {len(result)} columns, {result.duration_s:g} s"
     data = {"rows": result.rows, "columns": len(result), "duration_s": result.duration_s}
-    return Done(wrote=out, text=f"Wrote {out}: {rows}", data=data)
+    look = "view" if out.suffix.lower() in (".rrd", ".usd", ".usda", ".usdc") else "report"
+    return Done(wrote=out, text=rows, data=data, next=[("magtwin", look, out), ("magtwin", "info", out)])
 
 
 @app.command
@@ -109,10 +112,15 @@ def fetch(
     base_url
         Address of a mirror with the same paths.
     """
-    from magtwin.fetch import default_folder
+    from magtwin.fetch import default_folder, is_complete
     from magtwin.fetch import fetch as fetch_files
+    from magtwin.files.outputs import free
 
     folder = out or default_folder(assets)
+    if not force and is_complete(assets, folder):
+        return Done(text=f"{folder}: all files are there already, as published", data={"wrote": []})
+    if out is not None or assets != "isaac-rules":  # these are looked for in one place
+        (folder,) = free(folder, force=force)
     with progress(f"Fetching {assets}", "files") as advance:
         files = fetch_files(assets, folder, base_url=base_url, force=force, progress=advance)
-    return Done(wrote=folder, text=f"Wrote {len(files)} files to {folder}")
+    return Done(wrote=folder, text=f"{len(files)} files")

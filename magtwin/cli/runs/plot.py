@@ -58,7 +58,9 @@ def plot(
         Frames per second of a film [Hz]. Default: 25.
     """
     from magtwin.figures.drawing import draw
+    from magtwin.files.outputs import free
 
+    (out,) = free(out or Path(f"{files[0].stem}.png"), force=force)
     options: dict[str, Any] = {"at_s": at_s, "camera": camera, "scene": scene, "pace": pace, "fps": fps}
     options |= {"headings": headings_deg and headings_rad(headings_deg), "size": size and _size(size)}
     with progress(f"Drawing {files[0].name}", "frames") as advance:

@@ -1,6 +1,5 @@
 """`magtwin report`, `compare` and `reproduce`."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -8,16 +7,8 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force, RunScene
-from magtwin.cli.terminal import (
-    Done,
-    announce,
-    check_output,
-    print_report,
-    progress,
-    say,
-    stdout_console,
-    step,
-)
+from magtwin.cli.terminal import Done, named, progress, step
+from magtwin.report.summary import aligned
 
 if TYPE_CHECKING:
     from magtwin.run.compare import Comparison
@@ -44,10 +35,10 @@ def report(
     """
     from magtwin.figures.views import report_runs
 
-    check_output(out, (".html",), "a report", force=force)
+    out = named(out, (".html",), "a report", force=force)
     with progress("Reporting", "runs") as advance:
         report_runs(runs, out, scene=scene, force=force, progress=advance)
-    return Done(wrote=out)
+    return Done(wrote=out, text="open it in a browser")
 
 
 @app.command
@@ -76,11 +67,11 @@ def compare(
     """
     from magtwin.figures.views import compare_files, names_of
 
-    check_output(out, (".png", ".svg"), "a comparison", force=force)
+    out = out and named(out, (".png", ".svg"), "a comparison", force=force)
     step("Comparing the runs")
     comparison = compare_files(a, b, align=align, out=out, force=force)
-    names = names_of(a, b)
-    return Done(wrote=out or (), table=lambda: _print(comparison, names), data=comparison.summary())
+    lines, draw = _lines(comparison, names_of(a, b)), ("magtwin", "plot", a, b, "--out", "difference.png")
+    return Done(wrote=out or (), lines=lines, data=comparison.summary(), next=() if out else (draw,))
 
 
 @app.command
@@ -97,32 +88,19 @@ def reproduce(file: Path, *, scene: RunScene = None) -> Done:
     """
     from magtwin.io.provenance import repeat_of
 
-    announce("Reproducing the run")
+    step("Reproducing the run")
     found = repeat_of(file, scene)
-    report = found.report(f"{file}, reproduced")
-
-    def table() -> None:
-        for cause in found.causes:
-            say(cause)
-        print_report(replace(report, metadata={}))
-
-    return Done(report, table=table, status=0 if found.equal else 1)
+    return Done(found.report(f"{file}, reproduced"), status=0 if found.equal else 1)
 
 
-def _print(comparison: "Comparison", names: tuple[str, str]) -> None:
-    """Print the agreements as a table."""
-    from rich.table import Table
-    from rich.text import Text
-
+def _lines(comparison: "Comparison", names: tuple[str, str]) -> list[str]:
+    """The agreements as lines of a table."""
     shift = f"moved by {comparison.shift:+.4f} {comparison.unit}"
     how = "clocks as recorded" if comparison.align == "none" else shift
-    console = stdout_console()
-    console.print(Text(f"{names[1]} less {names[0]}, {how}; {len(comparison.at):,} readings", style="bold"))
-    table = Table(box=None, pad_edge=False)
-    for column in ("", "unit", "mean", "RMS", "mean abs.", "greatest", "correlation"):
-        table.add_column(column, justify="left" if column in ("", "unit") else "right", no_wrap=True)
+    rows: list[tuple[str, ...]] = [("", "unit", "mean", "RMS", "mean abs.", "greatest", "correlation")]
     for row in comparison.agreements():
         correlation = "" if row.correlation is None else f"{row.correlation:.4f}"
         numbers = (f"{value:,.4g}" for value in (row.mean, row.rms, row.mae, row.greatest))
-        table.add_row(row.name, row.unit, *numbers, correlation)
-    console.print(table)
+        rows.append((row.name, row.unit, *numbers, correlation))
+    head = f"{names[1]} less {names[0]}, {how}; {len(comparison.at):,} readings"
+    return [head, *aligned(rows, right=range(2, 7))]

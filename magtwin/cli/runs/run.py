@@ -23,13 +23,16 @@ from magtwin.cli.options import (
     check_pace,
 )
 from magtwin.cli.settings import RUN, RunOptions, RunSettings
-from magtwin.cli.terminal import Done, announce, note, progress, step
+from magtwin.cli.terminal import Done, note, progress, step
 from magtwin.errors import InputError, find
 
 if TYPE_CHECKING:
     from magtwin.io.outputs import Driven, Outputs
 
 Outs = Annotated[list[Path] | None, Parameter(consume_multiple=False)]
+
+SHOWN = ("duration", "distance driven", "readings", "b_total_nt", "error")
+"""Figures of a run that are printed."""
 
 
 @app.command
@@ -49,32 +52,33 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False) -> D
     from magtwin.figures.pictures import picture_of_stage
     from magtwin.figures.views import report_runs
     from magtwin.files.file import shipped
-    from magtwin.files.outputs import output
+    from magtwin.files.outputs import free, output
     from magtwin.io.outputs import Outputs, drive
     from magtwin.twin import scene_from_toml
 
+    (out,) = free(out, force=force)
     with output(out, force=force) as folder:
-        announce("Authoring the TurtleBot 4 from its URDF")
+        step("Authoring the TurtleBot 4 from its URDF")
         source = shipped("robots", "turtlebot4")
         asset = folder / "robot" / "turtlebot4.usda"
         build_robot(source / "turtlebot4.urdf", source / "robot.toml", asset)
-        announce("Authoring the lab around it, with its magnetic map")
+        step("Authoring the lab around it, with its magnetic map")
         scene = scene_from_toml(shipped("scenes", "lab.toml"))
         scene = replace(scene, robot=replace(scene.robot, asset=asset))
         scene_file = author_scene(scene, folder / "scene")
         relative = {"scene_file": scene_file.relative_to(folder).as_posix()}
-        driven = drive(scene_file, seed=seed, metadata=relative, report=announce)
-        announce("Writing the run and pictures")
+        driven = drive(scene_file, seed=seed, metadata=relative, report=step)
+        step("Writing the run and pictures")
         Outputs(folder, picture=save_picture).write(driven)
         report_runs([folder / "run.parquet"], folder / "run.html")
         try:
             picture_of_stage(scene_file, folder / "lab.png")
         except InputError as error:  # OpenGL is missing
             note(f"no picture of the stage: {error}")
-    pictures = ", ".join(str(file) for file in sorted(out.glob("*.png")))
-    look = f"{out / 'run.html'} in a browser, or magtwin view {out / 'run.rrd'}"
-    text = f"\nLook at it:  {look}\nPictures:    {pictures}"
-    return Done(driven.run.report(f"Demo in {out}"), out, text=text)
+    pictures = ", ".join(file.name for file in sorted(out.glob("*.png")))
+    text = f"open {out / 'run.html'} in a browser; pictures {pictures}"
+    told, view = driven.run.report("figure8 in the lab"), ("magtwin", "view", out / "run.rrd")
+    return Done(told, out, SHOWN, text=text, rest=f"magtwin info {out}", next=(view,))
 
 
 @app.command
@@ -166,14 +170,31 @@ def run(
             raise InputError(f"--engine newton drives one robot by itself, and {scene} has {names}; drop it")
         if robot is None and (path or fit):
             raise InputError(f"which of {names} is to drive {path or 'figure8'}? name it with --robot NAME")
+        outputs = outputs.free(() if robot else robots)
         return _run_robots(scene, outputs, what, robot=robot, meet=settings.meet or "refuse", **options)
+    outputs = outputs.free()
     if settings.meet is not None:
         raise InputError(f"`meet` is for several robots, and {scene} has one; drop it")
     if what is None:
         what = path = str(next(iter(robots.values())) or "figure8")
     step("Opening the scene")
     driven = _run_one(scene, outputs, what, path, settings, live=live, engine=engine, **options)
-    return Done(driven.run.report(f"{path} in {scene}"), tuple(outputs.targets))
+    title = f"{path} in {scene.stem}"
+    made, told = outputs.targets, driven.run.report(title)
+    return Done(told, tuple(made), SHOWN, rest=f"magtwin info {made[0]}", next=look_at(made))
+
+
+def look_at(written: list[Path]) -> list[tuple[object, ...]]:
+    """What to type to see a run: its recording, and its page."""
+    from magtwin.io.outputs import IN_FOLDER
+
+    files = [
+        file for out in written for file in ([out] if out.suffix else [out / name for name in IN_FOLDER])
+    ]
+    recording = next((file for file in files if file.suffix == ".rrd"), None)
+    table = next((file for file in files if file.suffix != ".rrd"), files[0])
+    shown: list[tuple[object, ...]] = [] if recording is None else [("magtwin", "view", recording)]
+    return [*shown, ("magtwin", "report", table)]
 
 
 SIMULATED = ("model_error", "tracking_error", "lidar", "outside", "rate_hz", "controller")
@@ -185,6 +206,7 @@ def _check(
 ) -> None:
     """Refuse options that are for another way of driving, and those that would be refused late."""
     from magtwin.run.run import Run
+    from magtwin.sim.motion.drive_input import drive_input
     from magtwin.sim.runs.simulate import check_asked
 
     if live and settings.viewer:
@@ -205,6 +227,8 @@ def _check(
         if given:
             raise InputError(f"{option} {fault}, and {path} is none; drop one")
     check_asked(options["duration_s"], settings.rate_hz, options["speed"])
+    if isinstance(what, str):
+        drive_input(what)  # refuses a wrong name
     if newton:
         from magtwin.sim.engines.newton import check_installed
 
@@ -235,10 +259,12 @@ def _run_one(
     with ExitStack() as stack:
         keep = stack.enter_context(outputs.kept())
         places = stack.enter_context(outputs.aside())
-        with progress("Driving in Newton" if newton else "Driving", "steps" if newton else "") as advance:
-            options |= {"progress": advance, "each": keep, "report": announce, "metadata": replayed}
-            driven = drive(scene, what, engine=engine, **options)
-        announce("Writing the run")
+        with progress(
+            f"Driving {path}{' in Newton' if newton else ''}", "steps" if newton else ""
+        ) as advance:
+            options |= {"progress": advance, "each": keep, "report": step, "metadata": replayed}
+            driven = drive(scene, what, engine=engine, tell=note, **options)
+        step("Writing the run")
         places.write(driven)
     if live or settings.viewer:
         _show(driven, settings.viewer, settings.pace or 1.0)
@@ -289,8 +315,7 @@ def _run_robots(
         for name in names:
             aside = stack.enter_context(replace(own[name], folder=None).aside())
             places[name] = replace(aside, folder=folder)
-        announce(f"Driving {', '.join(ways)}")
-        with progress("Driving", "") as advance:
+        with progress(f"Driving {', '.join(ways)}") as advance:
             runs = simulate_robots(
                 twin,
                 ways,
@@ -300,7 +325,7 @@ def _run_robots(
                 each=lambda name, block: kept[name](block),
                 **options,
             )
-        announce("Writing the runs")
+        step("Writing the runs")
         for name, run in runs.items():
             its = led_by(twin, name)
             planned = ways[name] if isinstance(ways[name], Planned) else None
@@ -310,7 +335,9 @@ def _run_robots(
     figures = tuple(replace(f, name=f"{n}: {f.name}") for n, r in reports.items() for f in r.figures)
     metadata = {name: report.metadata for name, report in reports.items()}
     files = dict.fromkeys(target for each in own.values() for target in each.targets)
-    return Done(Report(f"{', '.join(names)} in {scene}", figures, metadata), tuple(files))
+    report = Report(f"{', '.join(names)} in {scene.stem}", figures, metadata)
+    shown = [f"{name}: {figure}" for figure in ("distance driven", "error") for name in names]
+    return Done(report, tuple(files), shown, next=look_at([*files]))
 
 
 def _show(driven: "Driven", address: str | None, pace: float) -> None:

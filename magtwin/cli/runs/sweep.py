@@ -19,7 +19,7 @@ from magtwin.cli.options import (
     Whole,
 )
 from magtwin.cli.settings import SWEEP, SweepOptions
-from magtwin.cli.terminal import Done, announce, continued_by_a_repeat, progress
+from magtwin.cli.terminal import Done, continued_by_a_repeat, progress, step
 from magtwin.errors import InputError
 
 RUNS_A_SESSION = 5
@@ -82,7 +82,7 @@ def sweep(
         Number of processes. Default: one, with several threads.
     """
     from magtwin.files.kinds import scene_file
-    from magtwin.files.outputs import check_free
+    from magtwin.files.outputs import free
     from magtwin.io.outputs import driven_by
     from magtwin.parallel import parse_shard
     from magtwin.sim.motion.drive_input import drive_input
@@ -102,11 +102,12 @@ def sweep(
             raise InputError(f"--{name} must be a whole number from {least} up, got {value}")
     check_count(count)
     check_asked(duration_s, rate_hz, 0.2 if speed is None else speed)
-    check_free(out, force=force)
     paths = [driven_by(name) for name in path or MIXTURE]
     for what in paths:
         drive_input(what)  # refuses a wrong name before the scene is opened
-    announce("Opening the scene")
+    part = None if shard is None else parse_shard(shard)
+    out = out if part else free(out, force=force)[0]  # shards share one folder
+    step("Opening the scene")
     twin = open_twin(
         scene,
         lab=settings.lab,
@@ -116,7 +117,6 @@ def sweep(
         model_error=settings.model_error,
         tracking_error=settings.tracking_error,
     )
-    announce(f"Driving {count} runs")
     runs = drive_many(
         twin,
         [drive_input(what, room_of(twin), fit=fit) for what in paths],
@@ -131,8 +131,10 @@ def sweep(
         lidar=settings.lidar,
         outside=settings.outside,
     )
-    part = None if shard is None else parse_shard(shard)
     kept = jobs is not None or part is not None or dask is not None
     with continued_by_a_repeat(when=kept), progress("Driving", "runs") as advance:
         made = runs.save(out, force=force, jobs=jobs, shard=part, dask=dask, progress=advance)
-    return Done(made, out if out.exists() else Path(f"{out}.parts"))
+    if not out.exists():
+        return Done(made, Path(f"{out}.parts"), text="parts; the other shards complete them")
+    build = ("magtwin", "dataset", "build", out, "--map", scene, "--out", "set")
+    return Done(made, out, next=(build, ("magtwin", "report", out)))

@@ -5,7 +5,7 @@ from typing import Literal
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force
-from magtwin.cli.terminal import Done, announce
+from magtwin.cli.terminal import Done, step
 from magtwin.errors import InputError
 
 
@@ -43,10 +43,10 @@ def export(
     from magtwin.export.package import export_scene
     from magtwin.files.file import existing
     from magtwin.files.kinds import scene_file
-    from magtwin.files.outputs import check_free
+    from magtwin.files.outputs import free
 
-    check_free(out, force=force)
     stage = scene_file(scene)
+    (out,) = free(out, beside=("_magtwin",) if out.suffix.lower() == ".usdz" else (), force=force)
     if target == "gazebo" or (target is None and out.suffix.lower() == ".sdf"):
         from magtwin.export.gazebo import export_world
 
@@ -66,9 +66,10 @@ def export(
         to_onnx=_write_onnx if onnx and _has_onnx() else None,
         thumbnail=_draw if thumbnail and target != "viewer" else None,
         force=force,
-        progress=announce,
+        progress=step,
     )
-    return Done(made.report(), tuple(made.files))
+    check = ("magtwin", "validate", made.root)
+    return Done(made.report(), tuple(made.files), next=() if out.suffix.lower() == ".glb" else (check,))
 
 
 def _write_onnx(weights: Path, out: Path) -> None:

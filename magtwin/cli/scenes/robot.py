@@ -6,7 +6,7 @@ from typing import Literal
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Flag, Force, pairs
-from magtwin.cli.terminal import Done, check_output, step
+from magtwin.cli.terminal import Done, named, note, step
 from magtwin.errors import InputError
 
 
@@ -37,8 +37,8 @@ def robot(
     urdf
         Robot description (.urdf, .xacro); or a stage with one robot, to write as a URDF.
     out
-        Folder to make, with NAME.usda and its layers; or a .urdf to write from a stage, with the same
-        kinematics and inertia.
+        Folder to make, with NAME.usda and its layers; or one .usda with its meshes beside it; or a .urdf to
+        write from a stage, with the same kinematics and inertia.
     settings
         TOML with drive, battery, platform field, sensor mounts and conversion, such as
         robots/turtlebot4/robot.toml. Options given here override its [conversion].
@@ -69,8 +69,14 @@ def robot(
         Full report to write (.json).
     """
     given = dict(locals())
-    from magtwin.files.outputs import output, transaction
+    from magtwin.files.outputs import free, output, transaction
 
+    if out.suffix.lower() in (".usd", ".usdc", ".usdz"):
+        raise InputError(
+            f"{out}: a robot is a folder, or one file .usda; give {out.stem}, or {out.stem}.usda"
+        )
+    beside = {".usda": ("_meshes.usdc", "_textures"), ".urdf": ("_meshes",)}.get(out.suffix.lower(), ())
+    (out,) = free(out, beside=beside, force=force)
     if out.suffix.lower() == ".urdf":
         from magtwin.author.from_urdf import write_urdf
 
@@ -79,10 +85,14 @@ def robot(
             raise InputError("a stage is written as a URDF without other options than --force; drop them")
         if urdf.suffix.lower() in (".urdf", ".xacro"):
             raise InputError(f"{urdf}: is no stage; a URDF is written from .usd, .usda, .usdc or .usdz")
-        return Done(write_urdf(urdf, out, force=force), out)
+        told = write_urdf(urdf, out, force=force)
+        return Done(told, out, next=(("magtwin", "robot", out, "--out", out.stem),))
     from magtwin.author.from_urdf import DriveRule, from_urdf
 
-    check_output(report, (".json",), "a report", force=force)
+    if report is not None:
+        report = named(report, (".json",), "a report", force=force)
+    if out.suffix.lower() == ".usda" and single_file is None:
+        note(f"{out} is one file, with its meshes beside it; --out {out.stem} makes a folder of layers")
     same = ("skip_missing_includes", "profile", "fix_base", "merge_fixed", "single_file", "strict")
     choices = {name: given[name] for name in same} | {
         "packages": {name: Path(folder) for name, folder in pairs("package", package).items()} or None,
@@ -102,7 +112,9 @@ def robot(
         )
         if aside is not None:
             aside.write_text(made.report.to_json(), encoding="utf-8")
-    return Done(made.report.summary(), made.asset)
+    summary = made.report.summary()
+    following = (("magtwin", "plot", made.asset), ("magtwin", "validate", made.asset))
+    return Done(summary, made.asset, rest=f"magtwin info {made.asset}", next=following)
 
 
 def _thumbnail(asset: Path, out: Path) -> None:

@@ -1,7 +1,6 @@
 """`magtwin new` and `magtwin scene`."""
 
 import re
-import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,8 +10,11 @@ from typing import Any
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force, Network, pairs
-from magtwin.cli.terminal import Done, announce, check_output, progress
+from magtwin.cli.terminal import Done, named, progress, step
 from magtwin.errors import InputError
+
+FIGURES = ("size", "prims", "rigid bodies", "mass")
+"""Figures of a stage that are printed."""
 
 
 @app.command
@@ -27,22 +29,22 @@ def new(out: Path, *, force: Force = False) -> Done:
     out
         File to write: .toml for a room, whose scene gets the file's name; .py for a localizer.
     """
-    check_output(out, (".toml", ".py"), "a room or a localizer", force=force)
+    out = named(out, (".toml", ".py"), "a room or a localizer", force=force)
     if out.suffix.lower() == ".py":
         from magtwin.tasks.localizing import new_localizer
 
         new_localizer(out, force=force)
-        try_it = f"magtwin localize localizer_run/run.parquet --map lab --method {out.stem}:MyLocalizer"
-        folder = "" if out.parent == Path() else f"cd {shlex.quote(str(out.parent))}\n       "
-        drive = "magtwin run lab --out localizer_run"
-        return Done(wrote=out, text=f"Wrote {out}\nNext:  {folder}{drive}\n       {try_it}")
+        drive = ("magtwin", "run", "lab", "--out", "localizer_run")
+        method = ("--method", f"{out.stem}:MyLocalizer")
+        try_it = ("magtwin", "localize", "localizer_run/run.parquet", "--map", "lab", *method)
+        folder = [] if out.parent == Path() else [("cd", out.parent)]
+        return Done(wrote=out, next=(*folder, drive, try_it))
     from magtwin.twin import new_scene
 
     new_scene(out, force=force)
     room = out.with_suffix("")
-    stage = shlex.quote(str(room / f"{out.stem}.usda"))
-    author = f"magtwin scene {shlex.quote(str(out))} --out {shlex.quote(str(room))}"
-    return Done(wrote=out, text=f"Wrote {out}\nNext:  {author}\n       magtwin run {stage}")
+    author = ("magtwin", "scene", out, "--out", room)
+    return Done(wrote=out, next=(author, ("magtwin", "run", room / f"{out.stem}.usda")))
 
 
 @app.command(usage="Usage: magtwin scene [SPEC] --out PATH [OPTIONS]")
@@ -91,21 +93,21 @@ def scene(
         them is refused, and the difference is given in nT.
     """
     from magtwin.author.scene import author_scene
-    from magtwin.files.outputs import check_free, not_read
+    from magtwin.files.outputs import free, not_read
     from magtwin.twin import scene_from_toml, scene_with_robot
     from magtwin.usd.info import info_of_stage
     from magtwin.usd.robot import read_notes
 
     if spec is not None and not Path(spec).is_file():
         not_read(spec)
-    check_free(out, force=force)
+    (out,) = free(out, force=force)
     lines: list[str] = []
     with TemporaryDirectory() as workshop:
         with progress("Reading the scene", "headings") as advance:
             choices: dict[str, Any] = {"map_layer": map, "network": network, "workshop": workshop}
             choices |= {"report": lines.append, "progress": advance}
             if urdf is not None:
-                announce(f"Converting {urdf}")
+                step(f"Converting {urdf}")
                 choices |= {"name": out.resolve().name, "controllers": controllers}
                 choices |= {"packages": {n: Path(folder) for n, folder in pairs("package", package).items()}}
                 choices |= {"skip_missing_includes": bool(skip_missing_includes)}
@@ -115,15 +117,17 @@ def scene(
                 raise InputError("name a scene: a TOML, a scene that ships, or a robot with --urdf")
             else:
                 _check_unused(magnetometer=magnetometer, controllers=controllers, package=package, arg=arg)
-                announce(f"Reading {spec}")
+                step(f"Reading {spec}")
                 with _keys_for_flags():
                     read = scene_from_toml(spec, **choices)
-        announce("Authoring the stage")
+        step("Authoring the stage")
         root = author_scene(read, out, force=force)
         made = [s.robot for s in read.robots if s.robot.asset.is_relative_to(Path(workshop).resolve())]
-        notes = {f"notes on {robot.name}": read_notes(robot.asset) for robot in made}
-    report, text = info_of_stage(root), "\n".join([*lines, f"Wrote {root}"])
-    return Done(replace(report, metadata={**report.metadata, **notes}), root, text=text)
+        notes = {f"notes on {r.name}": told for r in made if (told := read_notes(r.asset))}
+    report = info_of_stage(root)
+    report = replace(report, metadata={**report.metadata, **notes})
+    following = (("magtwin", "run", root), ("magtwin", "view", root))
+    return Done(report, root, FIGURES, lines, rest=f"magtwin info {root}", next=following)
 
 
 @contextmanager

@@ -19,11 +19,12 @@ def schema(*, out: Path | None = None, force: Force = False) -> Done:
     out
         Folder to make, with plugInfo.json, generatedSchema.usda and schema.usda.
     """
+    from magtwin.files.outputs import free
     from magtwin.usd.schema import FOLDER, publish
     from magtwin.usd.schema.versions import TEXT
 
-    data = {"version": TEXT, "folder": str(FOLDER if out is None else out)}
     if out is None:
-        return Done(text=str(FOLDER), data=data)
+        return Done(text=str(FOLDER), data={"version": TEXT, "folder": str(FOLDER)})
+    (out,) = free(out, force=force)
     publish(out, force=force)
-    return Done(wrote=out, data=data)
+    return Done(wrote=out, data={"version": TEXT, "folder": str(out)})

@@ -7,7 +7,8 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force
-from magtwin.cli.terminal import Done, announce, check_output, print_error, printable, stdout_console
+from magtwin.cli.terminal import Done, named, print_error, printable, step
+from magtwin.report.summary import aligned
 
 if TYPE_CHECKING:
     from magtwin.export.validation.findings import Check, Findings, Severity
@@ -49,11 +50,11 @@ def validate(
     from magtwin.files.outputs import output
     from magtwin.learn.data.features import FEATURES
 
-    check_output(out, (".json",), "a report", force=force)
+    out = out and named(out, (".json",), "a report", force=force)
 
     def validated(file: Path) -> "Findings":
         def report(validator: str) -> None:
-            announce(f"{file.name}: {validator}")
+            step(f"Checking {file.name} by {validator}")
 
         return check(file, against or AGAINST, inputs=FEATURES, progress=report)
 
@@ -66,32 +67,22 @@ def validate(
     if skipped:
         print_error(f"asked for and not run: {skipped[0].validator}: {skipped[0].not_run}")
     failed = bool(skipped) or not all(findings.clean for findings in found)
-    return Done(table=lambda: _print(found), data=tables, status=int(failed))
+    told = [_lines_of(findings) for findings in found]
+    lines = [*(verdict for verdict, *_ in told), *(line for _, *lines in told for line in lines)]
+    return Done(lines=lines, wrote=out or (), data=tables, rest=str(out or ""), status=int(failed))
 
 
-def _print(found: "list[Findings]") -> None:
-    """Print a table per file, a row per validator, and below it the findings, errors first."""
-    from rich.padding import Padding
-    from rich.table import Table
-    from rich.text import Text
-
-    console = stdout_console()
-    for findings in found:
-        console.print(Text(printable(str(findings.file)), style="bold"))
-        table = Table(box=None, pad_edge=False)
-        for column in ("validator", "result"):
-            table.add_column(column, no_wrap=True)
-        for severity in SEVERITIES:
-            table.add_column(f"{severity}s", justify="right", no_wrap=True)
-        table.add_column("looked at", overflow="fold")
-        for check in findings.checks:
-            counts = ["" if check.not_run else str(check.count(severity)) for severity in SEVERITIES]
-            scope = Text(printable(check.not_run or check.scope))
-            table.add_row(check.validator, check.result, *counts, scope)
-        console.print(table)
-        for check in findings.checks:
-            for line in _lines(check):
-                console.print(Padding(Text(line), (0, 0, 0, 2), expand=False))
+def _lines_of(findings: "Findings") -> list[str]:
+    """The verdict on a file, a line for each validator, and the findings, errors first."""
+    rows = []
+    for check in findings.checks:
+        counts = [f"{n} {severity}s" for severity in SEVERITIES if (n := check.count(severity))]
+        said = check.not_run or ", ".join(counts) or "nothing found"
+        rows.append((f"  {check.validator}", check.result, f"{said}; {check.scope}" if check.scope else said))
+    ran = [check.validator for check in findings.checks if not check.not_run]
+    verdict = f"{findings.file}: {'passed' if findings.clean else 'FAILED'} the rules of {', '.join(ran)}"
+    found = [f"  {line}" for check in findings.checks for line in _lines(check)]
+    return [verdict, *aligned(rows), *found]
 
 
 def _lines(check: "Check") -> list[str]:

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import IO, Any, BinaryIO, cast
 
 import rerun_cli  # type: ignore[import-untyped]
 from rerun.experimental import Timeline, View, ViewerClient
@@ -42,6 +42,9 @@ LEAST_SIZE, MOST_SIZE = 200, 8000
 
 PATIENCE_S = 600.0
 """Time that a viewer that lives may take for a step, on a busy machine without a graphics card [s]."""
+
+LATE_S = 5.0
+"""Time after which an answer that did not come is late: Rerun's client waits for each for 15 s [s]."""
 
 FRAMES = 20
 """Frames after which a loaded file has shown something, and after which the viewer's notices are gone."""
@@ -186,7 +189,8 @@ def live_viewer(
                 process = subprocess.Popen(command, **options)
                 client = _connected(process, port, log, interrupts, draws=headless)
             assert client is not None  # else the interrupt was raised
-            yield f"rerun+http://{LOCALHOST}:{port}/proxy", client
+            patient = cast(ViewerClient, _Patient(client, process))
+            yield f"rerun+http://{LOCALHOST}:{port}/proxy", patient
         except (ConnectionError, RuntimeError) as error:
             if process is not None and _ended(process):
                 raise _ending(process, log) from error
@@ -194,6 +198,29 @@ def live_viewer(
         finally:
             if process is not None:
                 _end(process)
+
+
+class _Patient:
+    """A client that asks again when an answer is late, as long as its viewer lives."""
+
+    def __init__(self, client: ViewerClient, process: "subprocess.Popen[bytes]") -> None:
+        self._client, self._process = client, process
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        def call(*args: Any, **options: Any) -> Any:
+            last = time.monotonic() + PATIENCE_S
+            while True:
+                began = time.monotonic()
+                try:
+                    return getattr(self._client, name)(*args, **options)
+                except (ConnectionError, RuntimeError, TimeoutError):
+                    now = time.monotonic()
+                    if now - began < LATE_S or now > last or self._process.poll() is not None:
+                        raise
+                if name == "run_command":  # it was taken; once more could undo it
+                    return self.get_state()
+
+        return call
 
 
 @contextmanager

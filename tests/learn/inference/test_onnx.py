@@ -77,9 +77,9 @@ def test_the_file_says_what_goes_in_and_from_which_weights_it_came(weights, expo
 def test_info_tells_what_a_file_holds_and_runs_nothing_of_it(exported, capsys):
     main(["info", str(exported), "--json"])
     told = json.loads(capsys.readouterr().out)
-    assert told["figures"]["kind"]["value"] == "mlp"
-    assert told["figures"]["layers"]["value"] == "3-16-8-1"
-    assert told["figures"]["residual sd"]["value"] == 42.0
+    assert told["figures"]["kind"] == "mlp"
+    assert told["figures"]["layers"] == "3-16-8-1"
+    assert told["figures"]["residual_sd_nt"] == 42.0
     assert list(told["metadata"]["features"]) == ["yaw_deg", "odom_w_z", "battery_v"]
 
 

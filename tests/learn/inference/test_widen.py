@@ -110,7 +110,7 @@ def test_the_command_widens_a_file_and_carries_its_card_over(tmp_path, capsys):
     main(["model", "widen", str(given), *words])
     figures = json.loads(capsys.readouterr().out)["figures"]
     made = load_predictor(out)
-    assert figures["sd, other robots"]["value"] == pytest.approx(made.wide.mean_nt)
+    assert figures["sd_other_robots_nt"] == pytest.approx(made.wide.mean_nt)
     card = out.with_suffix(".md").read_text(encoding="utf-8")
     assert sha256(out) in card
     assert sha256(given) not in card
