@@ -12,12 +12,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from scenes import field_docs
-
 from magtwin.author.robot import RobotSettings
 from magtwin.author.scene_file import SceneFile, _SourceFile
 from magtwin.bench.suite import Suite
 from magtwin.learn.training.config import TrainConfig
+from scenes import field_docs
 
 FOLDER = Path(__file__).resolve().parents[1] / "magtwin/spec/toml"
 FILES = {
