@@ -45,14 +45,8 @@ def without(tmp_path):
 
     def run(*arguments, status=0, **options):
         command = [sys.executable, "-m", "magtwin", *map(str, arguments)]
-        done = subprocess.run(
-            command,
-            cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": path},
-            capture_output=True,
-            text=True,
-            **options,
-        )
+        options |= {"env": {**os.environ, "PYTHONPATH": path}, "capture_output": True, "text": True}
+        done = subprocess.run(command, cwd=tmp_path, **options)
         assert done.returncode == status, done.stdout + done.stderr
         return done.stdout + done.stderr
 
