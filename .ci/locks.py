@@ -97,8 +97,8 @@ def licence(package: Distribution) -> str:
     return text.strip().splitlines()[0]
 
 
-def bill(folder: Path) -> None:
-    """Write the licences and the bill of materials of this environment."""
+def bill(folder: Path) -> list[str]:
+    """Write the licences and the bill of materials of this environment; gives what is under the GPL."""
     folder.mkdir(parents=True, exist_ok=True)
     packages = {normal(p.metadata["Name"]): p for p in distributions()}
     rows = [(name, p.version, licence(p)) for name, p in sorted(packages.items()) if name != "magtwin"]
@@ -129,6 +129,7 @@ def bill(folder: Path) -> None:
     }
     (folder / "sbom.json").write_text(json.dumps(sbom, indent=1) + "\n", encoding="utf-8")
     print(f"{len(rows)} packages in {folder}")
+    return [name for name, _, words in rows if re.search(r"\bA?GPL|GNU (Affero )?General", words)]
 
 
 def main() -> int:
@@ -138,8 +139,10 @@ def main() -> int:
     parser.add_argument("--bill", type=Path)
     given = parser.parse_args()
     if given.bill:
-        bill(given.bill)
-    elif given.check:
+        strict = bill(given.bill)
+        print("\n".join(f"{name} is under the GPL: no user of magtwin may need it" for name in strict))
+        return int(bool(strict))
+    if given.check:
         found = list(faults())
         print(
             "\n".join([*found, "python .ci/locks.py writes the locks anew"])
@@ -147,8 +150,7 @@ def main() -> int:
             else "The locks are current"
         )
         return int(bool(found))
-    else:
-        write()
+    write()
     return 0
 
 
