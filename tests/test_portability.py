@@ -16,8 +16,8 @@ from magtwin.parallel import machine
 WITHOUT = """
 import ctypes, os, signal, sys, time
 for module, names in {
-    os: "killpg setpgid getuid sched_getaffinity posix_fallocate register_at_fork sysconf",
-    signal: "pthread_sigmask setitimer SIGKILL SIGHUP SIGALRM",
+    os: "killpg setpgid getuid sched_getaffinity posix_fallocate sysconf",
+    signal: "pthread_sigmask setitimer SIGHUP SIGALRM",
 }.items():
     for name in names.split():
         if hasattr(module, name):
