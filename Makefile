@@ -118,7 +118,7 @@ wheel-test: $(VENV)/.dev  ## Build the wheel, install it in an empty environment
 	rm -rf build/wheel && mkdir -p build/wheel
 	$(if $(UV),$(UV) build -q --wheel --out-dir build/wheel .,$(BIN)/python -m build -q --wheel --outdir build/wheel .)
 	$(call venv,build/wheel/venv)
-	$(call install,build/wheel/venv) -c constraints.txt build/wheel/*.whl
+	$(call install,build/wheel/venv) $(if $(UV),,--no-compile) -c constraints.txt build/wheel/*.whl
 	@size=$$(du -sm build/wheel/venv | cut -f1); echo "The default install takes $$size MB"; test $$size -le $(MOST_MB)
 	build/wheel/venv/bin/python .ci/locks.py --bill build/wheel
 	cd build/wheel && venv/bin/magtwin demo --out demo && venv/bin/magtwin info demo/run.parquet
