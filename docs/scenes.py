@@ -54,6 +54,9 @@ p_world = [0.0, 1.2, 0.0]
 * **File names** are relative to the TOML.
 * **Errors.** For an unknown key, the message proposes the nearest known one. For a wrong value, it gives
   file and line.
+* **Completion.** `magtwin new` writes the JSON schema of these keys beside the TOML, and names it in the
+  first line. Editors that know TOML schemas, such as those with taplo, complete and check the keys.
+  `magtwin schema --toml DIR` writes the schemas of all TOML files: scene, sources, robot, suite, training.
 
 ## Where the field comes from
 

@@ -3,7 +3,7 @@
 import magtwin as mt
 
 twin = mt.open_twin(mt.author_scene("lab", out="lab"), magnetometer="physical")
-mt.simulate(twin, "lawnmower", session="survey", rate_hz=5, seed=2).save("drive.parquet")
+mt.simulate(twin, "lawnmower", session="survey", rate_hz=2, seed=2).save("drive.parquet")
 
 survey = mt.read_survey("drive.parquet")  # also CSV, bags and folders of runs
 field = mt.fit_map(survey, method="gp")

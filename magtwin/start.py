@@ -23,6 +23,7 @@ _ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN  # started in the b
 if not _ignored:
     signal.signal(signal.SIGINT, _end)
 
+import _thread  # noqa: E402
 import sys  # noqa: E402
 import threading  # noqa: E402
 from typing import Any  # noqa: E402
@@ -80,6 +81,14 @@ def _sent_again(fault: Any) -> None:
 
 def _send_again() -> None:
     """Interrupt this process in a moment."""
-    timer = threading.Timer(AGAIN_S, os.kill, (os.getpid(), signal.SIGINT))
+    timer = threading.Timer(AGAIN_S, _interrupt)
     timer.daemon = True
     timer.start()
+
+
+def _interrupt() -> None:
+    """Send Ctrl-C to this process."""
+    if os.name == "nt":  # where os.kill ends the process
+        _thread.interrupt_main()
+    else:
+        os.kill(os.getpid(), signal.SIGINT)

@@ -31,7 +31,7 @@ PAGES = ("README.md", "docs/tour.md")
 
 LEFT_OUT = {
     r"make ": "CI runs it by itself",
-    r"git ": "the checkout is here",
+    r"git clone ": "this is the checkout",
     r"magtwin view ": "needs a window",
     r"magtwin fetch ": "needs the network; the folder is copied from the real data",
 }

@@ -132,7 +132,7 @@ def _named_as_typed(text: str) -> str:
 def _end_by_exceptions() -> None:
     """Turn signals that end the process into exceptions, so that partial outputs are removed."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
-    if os.name == "nt" or signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # nohup
+    if not hasattr(signal, "SIGHUP") or signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # Windows, nohup
         return
 
     def hang_up(*_: object) -> None:

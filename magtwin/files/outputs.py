@@ -351,7 +351,7 @@ class _Aside:
         elif os.path.lexists(self.place):
             try:
                 os.link(self.place, self.old, follow_symlinks=False)
-            except OSError:  # a file system without hard links
+            except (OSError, NotImplementedError):  # a file system or a system without hard links
                 self.place.rename(self.old)
         self.new.replace(self.place)
 
@@ -413,7 +413,7 @@ def _sync(path: Path, *, inside: bool = True) -> None:
     for child in path.iterdir() if inside and path.is_dir() else ():
         _sync(child)
     with suppress(OSError) if path.is_dir() else nullcontext():  # not every system can for a folder
-        number = os.open(path, os.O_RDONLY)
+        number = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
         try:
             os.fsync(number)
         finally:

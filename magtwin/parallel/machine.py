@@ -96,6 +96,22 @@ def ends_with_parent() -> Callable[[], None] | None:
     return ask
 
 
+def end_group(pid: int, *, ask: bool = False) -> None:
+    """Kill a process and those that it started, or `ask` them to end; 0 stands for this process.
+
+    Where there are no groups of processes (Windows), that process alone is ended.
+
+    Raises:
+        ProcessLookupError: It has ended.
+    """
+    if hasattr(os, "killpg"):
+        os.killpg(pid, signal.SIGTERM if ask else signal.SIGKILL)
+    elif pid:
+        os.kill(pid, signal.SIGTERM)
+    else:
+        os._exit(1)
+
+
 @contextlib.contextmanager
 def variables(values: Mapping[str, str | None]) -> Iterator[None]:
     """Set variables of the environment in the block, for a process or a library that starts there.

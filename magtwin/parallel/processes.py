@@ -3,7 +3,6 @@
 import contextlib
 import math
 import multiprocessing
-import os
 import pickle
 import signal
 import sys
@@ -15,7 +14,7 @@ from multiprocessing.connection import wait
 from typing import Any, Self
 
 from magtwin.errors import InputError
-from magtwin.parallel.machine import free_memory, processors, variables
+from magtwin.parallel.machine import end_group, free_memory, processors, variables
 from magtwin.parallel.pool import RETRIES, C, Failure, Limit, Outcome, R, WorkerError
 from magtwin.parallel.worker import serve
 
@@ -72,7 +71,7 @@ class _Worker:
         code, pid = self.process.exitcode, self.process.pid
         if pid is not None:
             with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(pid, signal.SIGKILL)
+                end_group(pid)
         self.process.kill()
         self.process.join()
         self.process.close()
@@ -85,7 +84,7 @@ def _reason(code: int | None) -> str:
     if code is None or code >= 0:
         return f"ended with status {code}"
     name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
-    return f"was killed by {name}" + (", as by a lack of memory" if -code == signal.SIGKILL else "")
+    return f"was killed by {name}" + (", as by a lack of memory" if name == "SIGKILL" else "")
 
 
 WORKER_BYTES = 300_000_000
@@ -266,6 +265,9 @@ def _outcome(index: int, message: tuple[Any, ...], at: str) -> Outcome[Any]:
 @contextlib.contextmanager
 def _no_interrupt() -> Iterator[None]:
     """Hold Ctrl-C back; a process that is started here holds it back until it says otherwise."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows; the process ignores it a moment later
+        yield
+        return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -12,6 +12,7 @@ from typing import Any
 
 from magtwin import compiled
 from magtwin.errors import InputError
+from magtwin.parallel.machine import end_group
 
 _beating: Connection | None = None
 """Where `beat` reports to, in a worker."""
@@ -32,8 +33,10 @@ def serve(connection: Connection, idle_s: float | None) -> None:
     """The life of a worker, which ends itself after `idle_s` without work."""
     global _beating
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which kills its workers
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    os.setpgid(0, 0)  # killed together with the processes that a task has started
+    if hasattr(signal, "pthread_sigmask"):  # neither on Windows
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    if hasattr(os, "setpgid"):
+        os.setpgid(0, 0)  # killed together with the processes that a task has started
     multiprocessing.current_process().daemon = False  # a task may start processes
     os.dup2(2, 1)  # stdout belongs to the parent
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -62,4 +65,4 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
-    os.killpg(0, signal.SIGKILL)
+    end_group(0)

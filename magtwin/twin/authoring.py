@@ -9,6 +9,7 @@ from magtwin.errors import find
 from magtwin.files.file import sha256, shipped
 from magtwin.files.kinds import expected
 from magtwin.files.outputs import check_free, output
+from magtwin.files.settings import copy_schemas
 from magtwin.spec.lab import SurveySpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import Scene
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
 
 NOTED_NT = 50.0
 """RMS difference of a map from its sources that is reported [nT]; above the error of a careful survey."""
+
+SCHEMA_FOLDER = ".magtwin"
+"""Folder beside a new TOML with its JSON schema."""
 
 _WORKSHOPS: "list[TemporaryDirectory[str]]" = []
 """Temporary folders of scenes, deleted when Python ends."""
@@ -161,6 +165,9 @@ def author_scene(
 def new_scene(out: str | FilePath, *, force: bool = False) -> FilePath:
     """Write a TOML with comments that describes a small furnished room, to start from.
 
+    Its first line names the schema by which editors complete its keys; that is written beside it, into
+    the hidden folder `.magtwin`.
+
     Args:
         out: TOML to write. The scene is named after it.
         force: Whether to replace a file that exists.
@@ -178,5 +185,6 @@ def new_scene(out: str | FilePath, *, force: bool = False) -> FilePath:
     text = shipped("scenes", "starter.toml").read_text(encoding="utf-8")
     text = text.replace('name = "room"', f'name = "{name}"', 1)
     with output(out, force=force) as aside:
-        aside.write_text(text, encoding="utf-8")
+        aside.write_text(f"#:schema ./{SCHEMA_FOLDER}/scene.schema.json\n\n{text}", encoding="utf-8")
+        copy_schemas(FilePath(out).parent / SCHEMA_FOLDER, "scene")
     return FilePath(out)

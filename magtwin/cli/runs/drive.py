@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -154,6 +155,11 @@ def _drive(recorder: "Recorder", hand: "Hand", device: int, dt: float, show: obj
 @contextmanager
 def device(gamepad: Path | None) -> Iterator[int]:
     """A gamepad, or the terminal with its keys one by one; the terminal is restored at the end."""
+    if find_spec("termios") is None:
+        raise InputError(
+            "keys and gamepads are read on Linux and macOS only; give commands as a table of t, v and w: "
+            "magtwin run SCENE --path commands.csv"
+        )
     if gamepad is not None:
         try:
             pad = os.open(gamepad, os.O_RDONLY | os.O_NONBLOCK)

@@ -27,7 +27,7 @@ from magtwin.files.file import existing
 from magtwin.files.outputs import output
 from magtwin.files.protobuf import fields
 from magtwin.io.rerun.series import TIMELINE
-from magtwin.parallel.machine import ends_with_parent
+from magtwin.parallel.machine import end_group, ends_with_parent
 
 LOCALHOST = "127.0.0.1"
 
@@ -279,7 +279,7 @@ def _ending(process: "subprocess.Popen[bytes]", log: IO[str]) -> InputError:
     """The error for a viewer that has ended, with the reason in its log."""
     log.seek(0)
     reason = _reason(log.read())
-    if process.returncode == -signal.SIGKILL:
+    if process.returncode == -9:  # SIGKILL, which Windows lacks
         reason = "it was killed from outside; if memory ran out, give a smaller `size`"
     if CANNOT_DRAW.search(reason):
         return InputError(f"the Rerun viewer cannot draw here: {reason}; {VULKAN}")
@@ -377,9 +377,9 @@ def _reason(log: str) -> str:
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
     """End a process and its children."""
-    for sign in (signal.SIGTERM, signal.SIGKILL):
+    for ask in (True, False):
         if process.poll() is None:
-            os.killpg(process.pid, sign)
+            end_group(process.pid, ask=ask)
             try:
                 process.wait(5)
             except subprocess.TimeoutExpired:
