@@ -148,7 +148,7 @@ def label(ax: Axes, x: str = "", y: str = "", *, title: str = "") -> None:
 
 def legend_above(ax: Axes, columns: int = 4, **options: Any) -> None:
     """A legend above the axes, if any line has a name, in two columns on a page."""
-    columns = columns if ax.get_figure(root=True).get_figwidth() > WIDTH_IN else min(columns, 2)
+    columns = columns if ax.figure.bbox.width > (WIDTH_IN + 0.1) * ax.figure.dpi else min(columns, 2)
     if options or ax.get_legend_handles_labels()[0]:
         ax.legend(ncols=columns, loc="lower left", bbox_to_anchor=(0, 1), **options)
 
