@@ -1,8 +1,9 @@
 """Maps: plots of anomaly maps, of the difference between two surveys, and of what stands on the floor."""
 
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,13 +20,14 @@ from magtwin.errors import InputError, find
 from magtwin.field.maps.difference import LISTED, MapDifference
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import colour_limits
-from magtwin.figures.canvas import Array, colour_bar, label, new_figure
+from magtwin.figures.canvas import WIDTH_IN, Array, Chart, colour_bar, label, new_figure
 from magtwin.figures.style import (
     BOUND,
     FAINT,
     FIELD_COLOURS,
     INK,
     MASKED,
+    PALETTE,
     PAPER,
     SIGNED_COLOURS,
     SLOPE_COLOURS,
@@ -61,6 +63,9 @@ OVERVIEW = {
 """What a map is drawn by, if nothing else is asked for."""
 
 HATCH = "////"
+
+EXTEND = {(False, False): "neither", (True, True): "both", (True, False): "min", (False, True): "max"}
+"""Ends of a colour bar that are pointed, by whether values lie below and above its scale."""
 
 
 @styled
@@ -106,42 +111,53 @@ def draw_map(
     for one in fields:
         if what != "mask" and not one.valid.any():
             raise InputError(f"map {one.name!r} has no valid node to draw")
+    several = len(fields) > 1
+    panels: list[_Panel | None]
     if what == "overview":
-        every = [_overview(name, one) for name in OVERVIEW for one in fields]
-        panels = [panel for panel in every if panel is not None]
+        panels, columns = _overviews(fields), len(fields) if several else 2
     else:
-        panels = [
-            panel for one in fields for panel in _by_heading(what, one, headings, several=len(fields) > 1)
-        ]
-    columns = len(fields) if len(fields) > 1 and what == "overview" else min(len(panels), 2)
+        panels = [panel for one in fields for panel in _by_heading(what, one, headings, several=several)]
+        columns = min(len(panels), 2)
     figure, axes = _panels(fields[0].extent, len(panels), columns)
-    legend = {}
-    for name in dict.fromkeys(panel.quantity for panel in panels):
-        quantity, mine = QUANTITIES[name], [k for k, panel in enumerate(panels) if panel.quantity == name]
-        scale = None if name == "mask" else _Scale.of([panels[k].layer for k in mine], quantity)
-        for k in mine:
-            panel, ax = panels[k], axes[k]
-            x, y, layer = _thinned(panel)
-            if scale is None:
-                draw_cells(ax, x, y, layer, ListedColormap([FAINT]))
-                legend["holds field"] = Patch(facecolor=FAINT)
-            else:
-                drawn = scale.draw(ax, x, y, layer)
-            ax.set_title(panel.title)
-            if plan is not None:
-                plan.draw(ax)
-            if np.isnan(layer).any():
-                legend[quantity.unknown] = _hatched()
-        if scale is not None:
+    legend: dict[str, Patch] = {}
+    for quantity, mine in _by_quantity(panels).items():
+        scale = _Scale.of(mine.values(), QUANTITIES[quantity])
+        for k, panel in mine.items():
+            drawn, keys = panel.draw(axes[k], scale, plan)
+            axes[k].set_title(panel.title)
+            legend |= keys
+        if quantity != "mask":
             ticks = scale.levels[:: max(1, len(scale.levels) // 8)]
-            colour_bar(figure, drawn, [axes[k] for k in mine], quantity.label, ticks=ticks)
-    if plan is not None:
-        legend |= plan.keys()
+            colour_bar(figure, drawn, [axes[k] for k in mine], QUANTITIES[quantity].label, ticks=ticks)
+    for ax, panel in zip(axes, panels, strict=False):
+        ax.set_visible(panel is not None)
     if legend:
         figure.legend(legend.values(), legend.keys(), loc="outside lower right", ncols=3)
-    if len(fields) == 1:
+    if not several:
         figure.suptitle(_summary(fields[0], 100 if len(panels) > 1 else 46), x=0.01, ha="left")
     return figure
+
+
+def map_charts(fields: Sequence[AnomalyMap], plan: "FloorPlan | None" = None) -> list[Chart]:
+    """The overview of maps as charts of a page; each quantity has one scale for all of them."""
+    charts = []
+    for quantity, mine in _by_quantity(_overviews(fields)).items():
+        scale = _Scale.of(mine.values(), QUANTITIES[quantity])
+        for panel in mine.values():
+            x0, x1, y0, y1 = panel.field.extent if plan is None else plan.extent(panel.field.extent)
+            tall = float(np.clip((WIDTH_IN - 0.8) * (y1 - y0) / (x1 - x0), 1.4, 6.0))
+            draw = partial(_draw_alone, panel=panel, scale=scale, plan=plan)
+            charts.append(
+                Chart(panel.title, draw, tall + 1.1, f"{quantity}_{panel.field.name}".replace(" ", "_"))
+            )
+    return charts
+
+
+def _draw_alone(ax: Axes, panel: "_Panel", scale: "_Scale", plan: "FloorPlan | None") -> None:
+    """A panel with its own bar."""
+    drawn, _ = panel.draw(ax, scale, plan)
+    colour_bar(ax.figure, drawn, ax, QUANTITIES[panel.quantity].label, below=True, ticks=scale.levels[::5])
+    label(ax, "x [m]", "y [m]")
 
 
 @styled
@@ -205,14 +221,12 @@ def mean_field_nt(field: AnomalyMap) -> Array:
     return np.where(field.valid.all(axis=0), field.values_nt.mean(axis=0), np.nan)
 
 
-def draw_mean(ax: Axes, field: AnomalyMap, *, quiet: bool = True) -> tuple[float, float]:
-    """Draw a map's mean over headings with its bar, paler if `quiet`; returns the ends of the scale [nT]."""
+def draw_mean(ax: Axes, field: AnomalyMap) -> tuple[float, float]:
+    """Draw a map's mean over headings pale, with its bar; returns the ends of the scale [nT]."""
     known = mean_field_nt(field)
     low, high = colour_limits(known)
-    colours = colormaps[FIELD_COLOURS]
-    if quiet:
-        pale = 0.5 * colours(np.linspace(0, 1, 64)) + 0.5
-        colours = LinearSegmentedColormap.from_list("pale", np.minimum(pale, 1.0))
+    pale = 0.5 * colormaps[FIELD_COLOURS](np.linspace(0, 1, 64)) + 0.5
+    colours = LinearSegmentedColormap.from_list("pale", np.minimum(pale, 1.0))
     mesh = draw_cells(ax, field.x_m, field.y_m, known, colours, vmin=low, vmax=high)
     colour_bar(ax.figure, mesh, ax, "map, mean over headings [nT]", below=True)
     return low, high
@@ -252,14 +266,15 @@ class FloorPlan:
         ):
             for outline in outlines:
                 ax.add_patch(Polygon(outline, **{"zorder": 2.5, **look}))
-        every = [*self.solids, *self.pieces, *self.doors]
-        if every:
-            (x0, y0), (x1, y1) = np.vstack(every).min(axis=0), np.vstack(every).max(axis=0)
-            left, right, low, high = (*ax.get_xlim(), *ax.get_ylim())
-            ax.set(
-                xlim=(min(left, x0 - 0.1), max(right, x1 + 0.1)),
-                ylim=(min(low, y0 - 0.1), max(high, y1 + 0.1)),
-            )
+        x0, x1, y0, y1 = self.extent((*ax.get_xlim(), *ax.get_ylim()))
+        ax.set(xlim=(x0, x1), ylim=(y0, y1))
+
+    def extent(self, least: Sequence[float]) -> tuple[float, float, float, float]:
+        """Ends along x and along y that hold the outlines and these ends [m]."""
+        ends = np.reshape(least, (2, 2)).T
+        outlines = [o + s for o in (*self.solids, *self.pieces, *self.doors) for s in (-0.1, 0.1)]
+        (x0, y0), (x1, y1) = (f(np.vstack([ends, *outlines]), axis=0).tolist() for f in (np.min, np.max))
+        return x0, x1, y0, y1
 
     def keys(self) -> dict[str, Patch]:
         """Entries of a legend."""
@@ -380,15 +395,48 @@ class _Panel:
     field: AnomalyMap
     layer: Array
 
+    def draw(
+        self, ax: Axes, scale: "_Scale", plan: "FloorPlan | None"
+    ) -> tuple[ScalarMappable, dict[str, Patch]]:
+        """Draw the layer and what stands there; returns what a colour bar needs, and a legend's entries."""
+        x, y, layer = _thinned(self)
+        keys = {} if plan is None else plan.keys()
+        if self.quantity == "mask":
+            drawn = draw_cells(ax, x, y, layer, ListedColormap([PALETTE["teal"][0]]), alpha=0.5)
+            keys["holds field"] = Patch(facecolor=PALETTE["teal"][0], alpha=0.5)
+        else:
+            drawn = scale.draw(ax, x, y, layer)
+        if plan is not None:
+            plan.draw(ax)
+        if np.isnan(layer).any():
+            keys[QUANTITIES[self.quantity].unknown] = _hatched()
+        return drawn, keys
 
-def _overview(name: str, field: AnomalyMap) -> _Panel | None:
+
+def _by_quantity(panels: Sequence[_Panel | None]) -> dict[str, dict[int, _Panel]]:
+    """Panels by their index, for each quantity."""
+    found: dict[str, dict[int, _Panel]] = {}
+    for k, panel in enumerate(panels):
+        if panel is not None:
+            found.setdefault(panel.quantity, {})[k] = panel
+    return found
+
+
+def _overviews(fields: Sequence[AnomalyMap]) -> list[_Panel | None]:
+    """The quantities of the overview that a map knows, of each map; None where only another one does."""
+    rows = [[_overview(name, field, several=len(fields) > 1) for field in fields] for name in OVERVIEW]
+    return [panel for row in rows if any(row) for panel in row]
+
+
+def _overview(name: str, field: AnomalyMap, *, several: bool) -> _Panel | None:
     """A quantity of the overview; None if the map does not know it."""
     if (name == "heading effect" and len(field.headings_rad) < 2) or (
         name == "sd" and field.variance_nt2 is None
     ):
         return None
     layer = _slope(mean_field_nt(field), field) if name == "gradient" else QUANTITIES[name].layers(field)[0]
-    return _Panel(OVERVIEW[name], name, field, layer) if np.isfinite(layer).any() else None
+    title = f"{field.name}, " * several + OVERVIEW[name]
+    return _Panel(title, name, field, layer) if np.isfinite(layer).any() else None
 
 
 def _by_heading(
@@ -430,9 +478,9 @@ class _Scale:
     """Ends of the colour bar that are pointed, as values lie beyond them."""
 
     @classmethod
-    def of(cls, layers: Sequence[Array], quantity: _Quantity) -> "_Scale":
+    def of(cls, panels: Iterable["_Panel"], quantity: _Quantity) -> "_Scale":
         """Bands over the known values of all panels."""
-        known = np.concatenate([layer[np.isfinite(layer)] for layer in layers])
+        known = np.concatenate([panel.layer[np.isfinite(panel.layer)] for panel in panels])
         low, high = colour_limits(known)
         if quantity.about_zero:
             low, high = -max(-low, high), max(-low, high)
@@ -440,8 +488,7 @@ class _Scale:
             low, high = (low - 0.1 * abs(low), high + 0.1 * abs(high)) if high else (-1.0, 1.0)
         levels = np.asarray(MaxNLocator(BANDS, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))
         beyond = (bool((known < levels[0]).any()), bool((known > levels[-1]).any()))
-        extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
-        return cls(levels, (low, high), colormaps[quantity.colours], extend)
+        return cls(levels, (low, high), colormaps[quantity.colours], EXTEND[beyond])
 
     def draw(self, ax: Axes, x: Array, y: Array, layer: Array) -> ScalarMappable:
         """Filled contours of one layer over its cells, which show beside unknown nodes."""

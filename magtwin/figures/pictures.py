@@ -45,9 +45,9 @@ AROUND_M = 0.7
 """Margin around and above a path that a camera over the lab keeps in view [m]."""
 
 TALL_M, WIDE_M, CEILING_M = 1.0, 1.2, 1.8
-"""Least height and width of a wall, and least height of a ceiling [m]. Furniture as large in one piece is one."""
+"""Least height and width of a wall, and least height of a ceiling [m]. Furniture of that size counts."""
 
-PILLAR_M, BESIDE_M = 2.2, 0.15
+PILLAR_M, BESIDE_M = 2.2, 0.25
 """Height from which what stands on the heat-map is a veil in front of it, and how far beside still counts as
 on it [m]. Lower furniture is solid."""
 
@@ -234,7 +234,7 @@ class Walls:
         return actors
 
     def cut(self, place: ArrayLike, points: Array, *, more: bool = False) -> None:
-        """Cut the walls that hide one of the points [m], shape (N, 3), from a place; with `more`, others stay cut."""
+        """Cut the walls that hide a point from a place [m], shapes (N, 3) and (3,); `more` keeps the cuts."""
         for k, (corners, (whole, *stump)) in enumerate(self._walls):
             inside = ((points > corners.min(axis=(0, 1))) & (points < corners.max(axis=(0, 1)))).all(axis=1)
             self._cut[k] = (more and self._cut[k]) or hides(corners, place, points[~inside])
@@ -309,10 +309,8 @@ def add_still(
     bodies: dict[tuple[bool, bool, float], list[Any]] = {}
     screens, walls, seen = [], Walls(plotter), [np.empty((0, 3))]
     floors = [v for s, v in zip(shapes, worlds, strict=True) if scale is not None and s.prim == scale.prim]
-    low, high = (
-        (np.vstack(floors).min(axis=0), np.vstack(floors).max(axis=0)) if floors else (np.inf, -np.inf)
-    )
-    high = high * (1, 1, 0) + (0, 0, PILLAR_M) if floors else high
+    floor = np.vstack(floors) if floors else np.full((1, 3), np.nan)  # nothing stands on an unknown one
+    low, high = floor.min(axis=0) - BESIDE_M, floor.max(axis=0) * (1, 1, 0) + (BESIDE_M, BESIDE_M, PILLAR_M)
     for shape, vertices in zip(shapes, worlds, strict=True):
         chosen, flat = is_subject(shape, scale), shape.vertex_colours is not None
         if not chosen and is_wall(shape, vertices):
@@ -380,7 +378,7 @@ def _draw(
         aim(plotter, camera, around, size, bar=scale is not None and legend)
         walls.cut(plotter.camera.position, points, more=more)
     if scale is not None and legend:
-        add_bar(plotter, scale.name, scale.least, scale.greatest, scale.unit)
+        add_bar(plotter, scale.name, (scale.least, scale.greatest), f"field [{scale.unit}]")
     return screens if any(subject) else []
 
 
@@ -594,22 +592,22 @@ def add_text(plotter: Any, text: str, letters: int) -> Any:
     return plotter.add_text(text, position=(0.02, 0.93), viewport=True, font_size=letters, color=INK)
 
 
-def add_bar(plotter: Any, colour_map: str, least: float, greatest: float, unit: str) -> None:
-    """A colour bar; a map in nT gets one in µT."""
+def add_bar(plotter: Any, colour_map: str, limits: tuple[float, float], title: str, half: str = "") -> None:
+    """A colour bar at the right, of the whole height or the "upper" or "lower" half."""
     import pyvista
     from matplotlib import colormaps
 
     if colour_map not in colormaps:
         raise InputError(f"the heat map's colourMap {colour_map!r} is none of matplotlib; correct the stage")
-    unit, factor = ("µT", 1e-3) if unit == "nT" else (unit, 1.0)
-    table = pyvista.LookupTable(colour_map, scalar_range=(least * factor, greatest * factor))
     points = pyvista.PolyData(np.zeros((2, 3)))
-    points["field"] = np.array([least, greatest]) * factor
+    points["field"] = np.array(limits)
+    table = pyvista.LookupTable(colour_map, scalar_range=limits)
     actor = plotter.add_mesh(points, scalars="field", cmap=table, opacity=0, show_scalar_bar=False)
     letters = max(8, round(min(plotter.window_size[1], plotter.window_size[0] / 1.6) / 42))
-    place = {"vertical": True, "position_x": 0.92, "position_y": 0.2, "height": 0.6, "width": 0.05}
-    font = {"fmt": "%.1f", "color": INK, "title_font_size": letters, "label_font_size": letters}
-    bar = plotter.add_scalar_bar(title=f"total field [{unit}]", mapper=actor.mapper, **place, **font)
+    low, high = {"": (0.2, 0.6), "upper": (0.54, 0.36), "lower": (0.06, 0.36)}[half]
+    place = {"vertical": True, "position_x": 0.92, "position_y": low, "height": high, "width": 0.05}
+    font = {"fmt": "%.0f", "color": INK, "title_font_size": letters, "label_font_size": letters}
+    bar = plotter.add_scalar_bar(title=title, mapper=actor.mapper, **place, **font)
     background = pyvista.Color(BACKGROUND).float_rgb
     bar.DrawBackgroundOn()  # keeps it readable in front of anything
     bar.GetBackgroundProperty().SetColor(background)

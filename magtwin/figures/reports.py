@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.statistics import map_metadata
 from magtwin.figures.canvas import (
     POINTS,
     Chart,
@@ -23,10 +24,11 @@ from magtwin.figures.canvas import (
     new_figure,
     short_pair,
 )
+from magtwin.figures.maps import FloorPlan, map_charts
 from magtwin.figures.page import Page, Section, Table
 from magtwin.figures.player import Player, player_of
 from magtwin.figures.runs import field_name, path_picture, position_name
-from magtwin.figures.style import DATA, MODEL, styled
+from magtwin.figures.style import DATA, MODEL, SERIES, styled
 from magtwin.report.report import Report
 from magtwin.run.compare import ERRORS, Agreement, Comparison, Traversals, errors_of, terms_of
 from magtwin.run.figures import prediction_nt
@@ -159,6 +161,85 @@ def page_of_report(
     section = Section(title, "", tuple(chart.picture() for chart in charts), tables)
     data = json.loads(report.to_json())
     return Page(title, lead, (section,), verdict=report.verdict, figures=shown[:5], data=data)
+
+
+def page_of_maps(fields: Sequence[AnomalyMap], plan: FloorPlan | None = None) -> Page:
+    """Maps as a page: each in a line; its mean, heading effect, spread and slope, on common scales."""
+    reports = [map_metadata(field) for field in fields]
+    verdicts = [_map_verdict(field, report) for field, report in zip(fields, reports, strict=True)]
+    charts = map_charts(fields, plan)
+    if len(fields) == 1:
+        page = page_of_report(replace(reports[0], verdict=verdicts[0]), f"Map {fields[0].name}", "", charts)
+        return replace(page, figures=_map_figures(reports[0]))
+    tables = [
+        replace(table, title=f"{table.title} of {field.name}", folded=True)
+        for field, report in zip(fields, reports, strict=True)
+        for table in (figures_table(report), provenance_table(report.metadata))
+    ]
+    section = Section("Maps", "", tuple(chart.picture() for chart in charts), tuple(tables))
+    data = {"maps": [json.loads(report.to_json()) for report in reports]}
+    return Page(f"{len(fields)} maps", "", (section,), data=data, verdict="\n".join(verdicts))
+
+
+def _map_figures(report: Report) -> list[tuple[str, str]]:
+    """Five figures of a map."""
+    found = {f.name: f for f in report.figures}
+    names = ("mean", "median gradient", "heading amplitude", "standard deviation", "masked nodes")
+    return [
+        (name, f"{found[name].value:,.5g} {found[name].unit}".strip())
+        for name in names
+        if name in found and isinstance(found[name].value, float | int)
+    ]
+
+
+def _map_verdict(field: AnomalyMap, report: Report) -> str:
+    """What a map is, in a line."""
+    figures = dict(_map_figures(report))
+    words = [f"{figures['mean']} on average"] if "mean" in figures else ["no field is known"]
+    sd = figures.get("standard deviation")
+    words.append(f"known to {sd} (median)" if sd else "with unknown uncertainty")
+    if "heading amplitude" in figures:
+        words.append(f"the heading changes it by {figures['heading amplitude']} (amplitude)")
+    return f"Map {field.name}: {', '.join(words)}."
+
+
+def page_of_check(report: Report) -> Page:
+    """How well methods predict readings that were left out of their fit, as a page: the best one first."""
+    values = {f.name: f for f in report.figures}
+    methods = [name.removesuffix(" RMSE") for name in values if name.endswith(" RMSE")]
+    measures = [name.removeprefix(f"{methods[0]} ") for name in values if name.startswith(f"{methods[0]} ")]
+
+    def value(method: str, measure: str) -> Any:
+        return values[f"{method} {measure}"].value if f"{method} {measure}" in values else ""
+
+    order = sorted(methods, key=lambda name: (float(100 - value(name, "predicted")) > 1, value(name, "RMSE")))
+    head = ("method", *(f"{name} [{values[f'{methods[0]} {name}'].unit or '-'}]" for name in measures))
+    rows = tuple((name, *(value(name, measure) for measure in measures)) for name in order)
+
+    def draw(ax: Axes) -> None:
+        for measure, look in (("RMSE", SERIES[0]), ("MAE", SERIES[1])):
+            marker = {"marker": "o" if measure == "RMSE" else "D", "ls": "", "color": look["color"], "ms": 7}
+            ax.plot([value(name, measure) for name in order], range(len(order)), label=measure, **marker)
+        ax.set_yticks(range(len(order)), order)
+        ax.set(ylim=(len(order) - 0.5, -0.5), xlim=(0, None))
+        ax.grid(axis="both")
+        label(ax, "error on left-out readings [nT]")
+        legend_above(ax)
+
+    best = order[0]
+    verdict = f"{best} predicts left-out readings best: RMSE {value(best, 'RMSE'):,.0f} nT"
+    if best != "naive" and "naive" in methods:
+        verdict += f", against {value('naive', 'RMSE'):,.0f} nT of their mean"
+    if value(best, "coverage"):
+        verdict += f"; its 90 % intervals hold {value(best, 'coverage'):.0f} % of them"
+    chart = Chart(
+        "Errors of each method on readings left out of its fit", draw, 1.4 + 0.3 * len(order), "errors"
+    )
+    table = Table("Methods", head, rows)
+    page = page_of_report(replace(report, verdict=f"{verdict}."), report.title, "", (chart,), (table,))
+    figures = [("readings", f"{values['readings predicted'].value:,}")]
+    figures += [(f"{name}, RMSE", f"{value(name, 'RMSE'):,.0f} nT") for name in order[:4]]
+    return replace(page, figures=figures)
 
 
 def figures_table(report: Report) -> Table:

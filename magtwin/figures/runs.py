@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.statistics import colour_limits
 from magtwin.figures.canvas import (
     POINTS,
     WIDTH_IN,
@@ -26,7 +27,7 @@ from magtwin.figures.canvas import (
     shade,
     zero_line,
 )
-from magtwin.figures.maps import FloorPlan, draw_mean, mean_field_nt
+from magtwin.figures.maps import EXTEND, FloorPlan, draw_mean
 from magtwin.figures.style import (
     DATA,
     FAINT,
@@ -86,9 +87,10 @@ def draw_run(
     figure = new_figure(14.0 if both else 8.0, 8.0 if len(panels) > 3 or not both else 6.0)
     sides = figure.subfigures(1, 1 + both, squeeze=False, width_ratios=(1.1, 1)[: 1 + both])[0]
     if place is not None:
-        p_xy, trail = trail_of(run, place)
-        draw_path(sides[0].subplots(), p_xy, trail, field, planned, plan)
-    sides[0].suptitle(_title(run, None if place is None else p_xy), x=0.02, ha="left")
+        if not np.isfinite(run[place][:, :2]).all(axis=1).any():
+            raise InputError(f"no position is known in {place!r} of the run")
+        draw_path(sides[0].subplots(), run, place, field, planned, plan)
+    sides[0].suptitle(_title(run, place), x=0.02, ha="left")
     if panels:
         heights = [panel.height for panel in panels]
         axes = sides[-1].subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
@@ -204,69 +206,69 @@ def _residuals(run: Run) -> list[Panel]:
     ]
 
 
-def trail_of(run: Run, place: str) -> tuple[Array, tuple[Array, str]]:
-    """A path's known points [m], shape (N, 2); and there the reading, less the map if known, with its name.
+@dataclass(frozen=True)
+class Trail:
+    """What colours a path: the reading less the map, about zero; or the reading if no map is known."""
 
-    Raises:
-        InputError: No position is known.
-    """
-    known = np.isfinite(run[place][:, :2]).all(axis=1)
-    if not known.any():
-        raise InputError(f"no position is known in {place!r} of the run")
-    name = field_name(run)
-    if name is None:
-        values, text = np.full(run.rows, np.nan), ""
-    elif _has(run, "b_map_nt") and name != "b_map_nt":
-        values, text = run[name] - run["b_map_nt"], "reading − map, along the path [nT]"
-    else:
-        values, text = run[name], f"{name.removesuffix('_nt')} along the path [nT]"
-    return run[place][known, :2], (values[known], text)
+    values: Array
+    """Values [nT], shape (N,), nan where unknown."""
+
+    name: str
+    limits: tuple[float, float]
+    colours: str
+
+    @classmethod
+    def of(cls, run: Run, limits: tuple[float, float] | None = None) -> "Trail":
+        """The trail of a run; `limits` [nT] are those of the map, on whose scale a reading is drawn."""
+        column = field_name(run)
+        values = run[column] if column else np.full(run.rows, np.nan)
+        if column in (None, "b_map_nt") or not _has(run, "b_map_nt"):
+            name = f"{(column or '').removesuffix('_nt')} [nT]" if column else ""
+            return cls(values, name, limits or colour_limits(values, 0), FIELD_COLOURS)
+        values = values - run["b_map_nt"]
+        size = np.abs(values[np.isfinite(values)])
+        reach = float(np.quantile(size, TRAIL_SHARE)) if len(size) else 0.0
+        return cls(values, "reading − map [nT]", (-reach or -1.0, reach or 1.0), SIGNED_COLOURS)
 
 
 def draw_path(
     ax: Axes,
-    p_xy: Array,
-    trail: tuple[Array, str],
+    run: Run,
+    place: str,
     field: AnomalyMap | None,
     planned: ArrayLike | None,
     plan: FloorPlan | None = None,
 ) -> None:
-    """Draw a path over the map, coloured along it.
+    """Draw the path of a run over the map, coloured by its `Trail`.
 
     Args:
         ax: Where to draw.
-        p_xy: Path in world [m], shape (N, 2).
-        trail: Values along it [nT], shape (N,), and their name; a difference from the map has a scale that
-            is even about zero, other readings have the scale of the map.
+        run: The run.
+        place: Its column of positions, of which one at least is known.
         field: The map below it, or None.
         planned: The planned path in world [m], shape (M, 2), or None.
         plan: Walls, furniture and doors, or None.
     """
-    values, name = trail
-    signed, size = "−" in name, np.abs(values[np.isfinite(values)])
-    shown = values if field is None else mean_field_nt(field)
-    limits = (float(np.nanmin(shown)), float(np.nanmax(shown))) if np.isfinite(shown).any() else (0.0, 1.0)
+    known = np.isfinite(run[place][:, :2]).all(axis=1)
+    p_xy, limits = run[place][known, :2], None
     if field is not None:
-        limits = draw_mean(ax, field, quiet=signed)
+        limits = draw_mean(ax, field)
+    trail = Trail.of(run, limits)
     if plan is not None:
         plan.draw(ax)
     elif field is None:
         ax.margins(0.08)
     for ink, width in ((INK, 6.0), (PAPER, 5.0)):  # one of the two edges differs from the map
         ax.plot(*p_xy[evenly(len(p_xy), 3000)].T, color=ink, lw=width, solid_capstyle="round")
-    if signed:
-        reach = float(np.quantile(size, TRAIL_SHARE)) if len(size) else 1.0
-        limits = (-reach or -1.0, reach or 1.0)
-    colours = SIGNED_COLOURS if signed else FIELD_COLOURS
-    line = coloured_line(ax, p_xy, values, limits, colours, 3.4)
+    line = coloured_line(ax, p_xy, trail.values[known], trail.limits, trail.colours, 3.4)
     if planned is not None:
         points = np.asarray(planned, float)[:, :2]
         ax.plot(*points.T, color=OTHER, lw=1.0, ls=(0, (4, 3)), zorder=4, label="planned")
     ax.plot(*p_xy[0], marker="o", ms=7, mfc=PAPER, mec=INK, ls="", zorder=5, label="start")
-    if name and (signed or field is None):
-        ends = bool(np.nanmin(values) < limits[0]), bool(np.nanmax(values) > limits[1])
-        extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(ends, "neither")
-        colour_bar(ax.figure, line, ax, name, below=True, extend=extend)
+    if trail.name and (field is None or trail.colours == SIGNED_COLOURS):
+        finite = trail.values[np.isfinite(trail.values)]
+        ends = bool((finite < trail.limits[0]).any()), bool((finite > trail.limits[1]).any())
+        colour_bar(ax.figure, line, ax, trail.name, below=True, extend=EXTEND[ends])
     ax.set_aspect("equal")
     label(ax, "x [m]", "y [m]")
     handles, names = ax.get_legend_handles_labels()
@@ -308,20 +310,21 @@ def path_picture(
     position, column = position_name(run), field_name(run)
     if position is None or column is None or np.isfinite(run[position][:, :2]).all(axis=1).sum() < 2:
         return None
-    p_xy, trail = trail_of(run, position)
+    p_xy = run[position][np.isfinite(run[position][:, :2]).all(axis=1), :2]
     wide, tall = np.ptp(p_xy, axis=0) if field is None else np.ptp(np.reshape(field.extent, (2, 2)), axis=1)
     height = float(np.clip((WIDTH_IN - 0.8) * tall / max(wide, 1e-9), 1.5, 6.0))
     figure = new_figure(WIDTH_IN, height + (1.9 if field is not None else 1.2))
-    draw_path(figure.subplots(), p_xy, trail, field, planned, plan)
+    draw_path(figure.subplots(), run, position, field, planned, plan)
     over = "the path" if field is None else f"the path over the map {field.name}"
-    what = trail[1].partition(",")[0].partition(" along")[0]
+    what = Trail.of(run).name.removesuffix(" [nT]")
     return picture(figure, f"Path driven, coloured by {what}", alt=f"{over}, coloured by {what}", kind=kind)
 
 
-def _title(run: Run, p_xy: Array | None = None) -> str:
-    """Scene, path and network of a run, its size, and its verdict."""
+def _title(run: Run, place: str | None) -> str:
+    """Scene, path and network of a run, and its size."""
     names = [str(run.metadata[key]) for key in ("scene", "path", "network") if run.metadata.get(key)]
     size = [f"{run.rows:,} readings", f"{run.duration_s:.1f} s"]
-    if p_xy is not None:
-        size.append(f"{np.linalg.norm(np.diff(p_xy, axis=0), axis=1).sum():.1f} m")
+    if place is not None:
+        steps = np.diff(run[place][np.isfinite(run[place][:, :2]).all(axis=1), :2], axis=0)
+        size.append(f"{np.linalg.norm(steps, axis=1).sum():.1f} m")
     return f"{', '.join(names) or 'run'}: {', '.join(size)}"

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
 from magtwin.figures.pictures import (
     BACKGROUND,
     LAB_ELEVATION_DEG,
@@ -34,6 +33,7 @@ from magtwin.figures.pictures import (
     style_of,
     write_png,
 )
+from magtwin.figures.runs import Trail
 from magtwin.files.outputs import output
 from magtwin.frames import matrix_from_quat, quat_from_yaw
 from magtwin.run.compare import FIELDS, HEADINGS, POSITIONS
@@ -51,9 +51,9 @@ ORBIT_DEG_S = 5.0
 TRAIL_STEP_M = 0.01
 """Step of the trail [m]."""
 
-TRAIL = ((0.065, 0.008, (32, 38, 45)), (0.05, 0.011, (255, 255, 255)), (0.026, 0.014, None))
+TRAIL = ((0.065, 0.008, (32, 38, 45)), (0.053, 0.011, (255, 255, 255)), (0.038, 0.014, None))
 """Half width [m], height above the floor [m] and colour of the trail's dark edge, white edge and middle. The
-middle has the colours of the field, as has the map below; one of the two edges differs from any of them."""
+middle tells what the map lacks; one of the two edges differs from any colour of the map below."""
 
 NEAR_M = 2.5
 """Distance from a path up to which all that stands there is in view, whole [m]."""
@@ -180,7 +180,7 @@ class Scenery:
         try:
             scale = read_colour_scale(stage)
             self._build(still, links, [s for s in shapes if s.link in moving], moving, fine, scale)
-            self._build_trail(run, (scale.least, scale.greatest) if scale else None)
+            self._build_trail(run, scale)
             light(self.plotter, self._everything, soft=fine)
             if not fine:
                 self.plotter.disable_anti_aliasing()
@@ -252,7 +252,7 @@ class Scenery:
         fast = f"   x{self._speed:.3g}" if self._speed != 1 else ""
         words = [f"{t - run['t'][0]:.1f} s" for t in self._times]
         if field:
-            words = [f"{w}   {b / 1000:.2f} µT" for w, b in zip(words, seen[field], strict=True)]
+            words = [f"{w}   {b:,.0f} nT" for w, b in zip(words, seen[field], strict=True)]
         if "v_base" in seen:
             speeds = np.round(seen["v_base"][:, 0], 2) + 0.0  # no "-0.00"
             words = [f"{w}   {v:.2f} m/s" for w, v in zip(words, speeds, strict=True)]
@@ -285,8 +285,8 @@ class Scenery:
             self._links[name] = link
         self._everything = np.vstack([*placed, self._p]).astype(float)
 
-    def _build_trail(self, run: Run, limits: tuple[float, float] | None) -> None:
-        """Build the whole trail, coloured by the field; a frame shows the part driven so far."""
+    def _build_trail(self, run: Run, scale: ColourScale | None) -> None:
+        """Build the whole trail, coloured as in a chart; a frame shows the part driven so far."""
         import pyvista
         from matplotlib import colormaps
 
@@ -304,13 +304,21 @@ class Scenery:
         if len(rows) < 2:
             return
         colours = np.tile(np.array(UNKNOWN, np.uint8), (len(rows), 1))
+        limits = None if scale is None else (scale.least, scale.greatest)
         if self._field:
-            b = run[self._field][rows]
-            low, high = limits or colour_limits(b)
-            known = np.isfinite(b)
-            share = (b[known] - low) / max(high - low, 1e-9)
-            colours[known] = (255 * colormaps[COLOUR_MAP](share)[:, :3]).round().astype(np.uint8)
-            add_bar(self.plotter, COLOUR_MAP, low, high, "nT")
+            trail = Trail.of(run, limits)
+            low, high = trail.limits
+            known = np.isfinite(trail.values[rows])
+            share = (trail.values[rows][known] - low) / max(high - low, 1e-9)
+            colours[known] = (255 * colormaps[trail.colours](share)[:, :3]).round().astype(np.uint8)
+            two = scale is not None and limits != trail.limits
+            add_bar(
+                self.plotter, trail.colours, trail.limits, trail.name.replace(" − ", "\n− "), "lower" * two
+            )
+            if scale is not None and two:
+                add_bar(
+                    self.plotter, scale.name, (scale.least, scale.greatest), f"map [{scale.unit}]", "upper"
+                )
         along = np.gradient(p_xy[rows], axis=0)
         along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
         left = np.column_stack([-along[:, 1], along[:, 0]])

@@ -16,31 +16,29 @@ def map_plot(
     file: MapFile,
     *,
     out: Path,
-    quantity: Literal["field", "gradient", "variance", "mask", "headings"] = "field",
+    quantity: Literal["overview", "field", "gradient", "variance", "mask", "headings"] = "overview",
     headings_deg: str | None = None,
     force: Force = False,
 ) -> Done:
-    """Draw a map as filled contours, one panel per heading.
+    """Draw a map: its mean, heading effect, standard deviation and gradient, or one of them by heading.
 
     Parameters
     ----------
     out
-        Picture to write (.png or .svg).
+        Picture (.png, .svg) or page (.html) to write.
     quantity
-        The field, its gradient along the floor, its standard deviation (variance), the masked nodes (mask),
-        or each heading minus the mean of all headings (headings).
+        All of it (overview); or with a panel per heading the field, its gradient along the floor, its
+        standard deviation (variance), the masked nodes (mask), or the heading less the mean (headings).
     headings_deg
         Headings to draw [deg], such as 0,90,180,270. Default: the map's, or four of them if it has more than
         eight.
     """
-    from magtwin.figures.canvas import save
-    from magtwin.figures.maps import draw_map
-    from magtwin.io.map_files import open_map
+    from magtwin.figures.views import plot_maps
 
-    check_output(out, PICTURES, "a picture", force=force)
+    check_output(out, (*PICTURES, ".html"), "a picture or a page", force=force)
     angles = None if headings_deg is None else headings_rad(headings_deg)
     step("Drawing the map")
-    save(draw_map(open_map(file), what=quantity, headings=angles), out, force=force)
+    plot_maps([file], out, quantity=quantity, headings=angles, force=force)
     return Done(wrote=out)
 
 
