@@ -151,8 +151,8 @@ def _verdict(every: Sequence[Standing]) -> str:
         if best is None or best.rmse_m is None:
             lines.append(f"{scenario}: no localizer has a result.")
             continue
-        least = f", {best.ratio:.2f} times its bound" if math.isfinite(best.ratio) else ""
-        lines.append(f"{scenario}: {best.localizer} is best, RMSE {_interval(best.rmse_m)} m{least}.")
+        bound = f", {best.ratio:.2f} times its bound" if math.isfinite(best.ratio) else ""
+        lines.append(f"{scenario}: {best.localizer} has the least RMSE, {_interval(best.rmse_m)} m{bound}.")
     return "\n".join(lines)
 
 

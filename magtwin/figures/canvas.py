@@ -17,12 +17,13 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
-from matplotlib.ticker import StrMethodFormatter
+from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.figures.style import FAINT, LIDAR, styled
+from magtwin.figures.style import FAINT, LIDAR, PAPER, styled
 from magtwin.files.outputs import output
 from magtwin.report.summary import printable_lines
 from magtwin.run.thinning import newest
@@ -40,6 +41,9 @@ POINTS = 1200
 
 SEGMENTS = 3000
 """Segments of a coloured line. More cannot be told apart."""
+
+SHORT_NAME = 18
+"""Characters of names of which two stand side by side on a page."""
 
 LONGEST_NAME = 28
 """Characters of a name in a legend or caption."""
@@ -147,9 +151,11 @@ def label(ax: Axes, x: str = "", y: str = "", *, title: str = "") -> None:
 
 
 def legend_above(ax: Axes, columns: int = 4, **options: Any) -> None:
-    """A legend above the axes, if any line has a name, in two columns on a page."""
-    columns = columns if ax.figure.bbox.width > (WIDTH_IN + 0.1) * ax.figure.dpi else min(columns, 2)
-    if options or ax.get_legend_handles_labels()[0]:
+    """A legend above the axes, if any line has a name; on a page in as many columns as its names allow."""
+    names = [str(entry) for entry in options.get("labels", ax.get_legend_handles_labels()[1])]
+    if ax.figure.bbox.width < (WIDTH_IN + 0.1) * ax.figure.dpi:
+        columns = 2 if max(map(len, names), default=0) <= SHORT_NAME else 1
+    if options or names:
         ax.legend(ncols=columns, loc="lower left", bbox_to_anchor=(0, 1), **options)
 
 
@@ -160,7 +166,8 @@ def legend_below(figure: Figure, *entries: Any, columns: int = 2) -> None:
 
 def colour_bar(figure: Any, drawn: ScalarMappable, axes: Any, title: str, **options: Any) -> None:
     """A colour bar with a title, to the right or, with `below`, under the axes."""
-    below = {"orientation": "horizontal", "aspect": 36} if options.pop("below", False) else {}
+    flat = {"orientation": "horizontal", "aspect": 36, "ticks": MaxNLocator(4)}
+    below = flat if options.pop("below", False) else {}
     bar = figure.colorbar(drawn, ax=axes, **{"shrink": 0.9, "pad": 0.02, **below, **options})
     bar.outline.set_visible(False)
     label(bar.ax, **({"x": title} if below else {"y": title}))
@@ -211,6 +218,11 @@ def shade(ax: Axes, t: Array, on: NDArray[np.bool_], *, colour: str = LIDAR, nam
     for k, (first, last) in enumerate(edges.reshape(-1, 2)):
         end = t[min(last, len(t) - 1)]
         ax.axvspan(t[first], end, color=colour, lw=0, zorder=-1, label="_" if k else name)
+
+
+def halo(width: float = 1.6) -> dict[str, Any]:
+    """The look of a line over a map: a rim in the colour of the paper."""
+    return {"path_effects": [withStroke(linewidth=2 * width, foreground=PAPER)]}
 
 
 def zero_line(ax: Axes) -> None:

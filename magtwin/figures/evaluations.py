@@ -315,6 +315,7 @@ def _floor_plan(evaluation: Evaluation) -> list[Picture]:
         figure = new_figure(WIDTH_IN, height + 1.9)
         ax, place = figure.subplots(), np.isfinite(one.p_xy).all(axis=1)
         draw_mean(ax, named.field)
+        ax.plot(*one.p_xy[place][evenly(int(place.sum()), 3000)].T, color=INK, lw=3.8)
         line = coloured_line(ax, one.p_xy[place], error[place], (-reach, reach), SIGNED_COLOURS, 2.6)
         colour_bar(figure, line, ax, "error [nT]", below=True, extend="both")
         label(ax, "x [m]", "y [m]")

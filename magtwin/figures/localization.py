@@ -24,6 +24,7 @@ from magtwin.figures.canvas import (
     Chart,
     draw_line,
     evenly,
+    halo,
     label,
     legend_above,
     new_figure,
@@ -146,7 +147,7 @@ def _draw_floor(ax: Axes, result: Localization, field: AnomalyMap | None) -> Non
     entries: list[Line2D | Patch] = []
 
     def path(p: Array, name: str, **look: Any) -> None:
-        entries.extend(ax.plot(*p[evenly(len(p), 3000), :2].T, label=name, **look))
+        entries.extend(ax.plot(*p[evenly(len(p), 3000), :2].T, label=name, **halo(), **look))
 
     if result.dead_reckoning is not None:
         path(result.dead_reckoning.pose, _dead_name(result), zorder=3, **DEAD_LOOK)

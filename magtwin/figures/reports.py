@@ -16,6 +16,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import map_metadata
 from magtwin.figures.canvas import (
     POINTS,
+    WIDTH_IN,
     Chart,
     draw_line,
     evenly,
@@ -25,7 +26,7 @@ from magtwin.figures.canvas import (
     short_pair,
 )
 from magtwin.figures.maps import FloorPlan, map_charts
-from magtwin.figures.page import Page, Section, Table
+from magtwin.figures.page import Page, Section, Table, text_of
 from magtwin.figures.player import Player, player_of
 from magtwin.figures.runs import field_name, path_picture, position_name
 from magtwin.figures.style import DATA, MODEL, SERIES, styled
@@ -33,6 +34,9 @@ from magtwin.report.report import Report
 from magtwin.run.compare import ERRORS, Agreement, Comparison, Traversals, errors_of, terms_of
 from magtwin.run.figures import prediction_nt
 from magtwin.run.run import COLUMNS, Metadata, Run
+
+MOST_FIGURES = 14
+"""Figures above which their table is folded."""
 
 MOST_SPANS = 12
 """Times of a flag that a page lists. More are counted."""
@@ -152,11 +156,8 @@ def page_of_report(
     report: Report, title: str, lead: str = "", charts: Sequence[Chart] = (), tables: Sequence[Table] = ()
 ) -> Page:
     """A report as a page: its verdict, first figures, charts, and tables, its source folded."""
-    shown = [
-        (f.name, f"{f.value:,.5g} {f.unit}".strip())
-        for f in report.figures
-        if isinstance(f.value, float | int)
-    ]
+    numbers = [f for f in report.figures if isinstance(f.value, float | int)]
+    shown = [(f.name, f"{text_of(f.value)} {f.unit}".strip()) for f in numbers]
     tables = (*tables, figures_table(report), provenance_table(report.metadata))
     section = Section(title, "", tuple(chart.picture() for chart in charts), tables)
     data = json.loads(report.to_json())
@@ -165,7 +166,7 @@ def page_of_report(
 
 def page_of_maps(fields: Sequence[AnomalyMap], plan: FloorPlan | None = None) -> Page:
     """Maps as a page: each in a line; its mean, heading effect, spread and slope, on common scales."""
-    reports = [map_metadata(field) for field in fields]
+    reports = [_in_nt(map_metadata(field)) for field in fields]
     verdicts = [_map_verdict(field, report) for field, report in zip(fields, reports, strict=True)]
     charts = map_charts(fields, plan)
     if len(fields) == 1:
@@ -181,12 +182,23 @@ def page_of_maps(fields: Sequence[AnomalyMap], plan: FloorPlan | None = None) ->
     return Page(f"{len(fields)} maps", "", (section,), data=data, verdict="\n".join(verdicts))
 
 
+def _in_nt(report: Report) -> Report:
+    """A report in which slopes have the unit of the fields."""
+    figures = [
+        replace(f, value=1000 * f.value, unit="nT/m")
+        if f.unit == "uT/m" and isinstance(f.value, float)
+        else f
+        for f in report.figures
+    ]
+    return replace(report, figures=tuple(figures))
+
+
 def _map_figures(report: Report) -> list[tuple[str, str]]:
     """Five figures of a map."""
     found = {f.name: f for f in report.figures}
     names = ("mean", "median gradient", "heading amplitude", "standard deviation", "masked nodes")
     return [
-        (name, f"{found[name].value:,.5g} {found[name].unit}".strip())
+        (name, f"{text_of(found[name].value)} {found[name].unit}".strip())
         for name in names
         if name in found and isinstance(found[name].value, float | int)
     ]
@@ -244,10 +256,9 @@ def page_of_check(report: Report) -> Page:
 
 def figures_table(report: Report) -> Table:
     """The figures of a report."""
-    rows = tuple(
-        (f.name, f.value, "" if f.spread is None else f.spread, f.unit, f.note) for f in report.figures
-    )
-    return Table("Figures", ("quantity", "value", "standard deviation", "unit", "note"), rows)
+    head = ("quantity", "value", "standard deviation", "unit", "note")
+    rows = [(f.name, f.value, "" if f.spread is None else f.spread, f.unit, f.note) for f in report.figures]
+    return Table("Figures", head, tuple(rows), folded=len(rows) > MOST_FIGURES)
 
 
 def provenance_table(metadata: Mapping[str, Any], title: str = "Provenance") -> Table:
@@ -431,7 +442,9 @@ def _charts(a: NamedRun, b: NamedRun, comparison: Comparison) -> list[Chart]:
         apart = [(comparison.at, part) for part in (comparison.along_m, comparison.cross_m)]
         draw = lines(along, "distance [m]", *apart, names=("along-track", "cross-track"))
         charts.append(Chart(f"distance of {names[1]} from {names[0]}", draw, file="distance"))
-        charts.append(Chart("paths", paths, 4.0, "paths"))
+        wide, tall = np.ptp(np.vstack([run[position][:, :2] for run in (a.run, b.run)]), axis=0)
+        height = float(np.clip((WIDTH_IN - 0.8) * tall / max(wide, 1e-9), 1.4, 5.0)) + 1.0
+        charts.append(Chart("paths", paths, height, "paths"))
     return charts
 
 

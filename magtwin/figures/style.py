@@ -48,9 +48,8 @@ FIELD_COLOURS, SIGNED_COLOURS, SPREAD_COLOURS, SLOPE_COLOURS = "viridis", "RdBu_
 """Colour scales: of a field, of differences about zero, of standard deviations, and of slopes."""
 
 SERIES = tuple(
-    {"color": PALETTE[name][0], "ls": dash}
-    for dash in ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))
-    for name in ("data", "model", "green", "violet", "red", "teal", "brown")
+    {"color": PALETTE[name][0], "ls": ("-", (0, (5, 1.5)), (0, (1.5, 1.2)))[k % 3]}
+    for k, name in enumerate(3 * ("data", "model", "green", "violet", "red", "teal", "brown"))
 )
 """Looks of lines that are compared, by their index: no two alike in colour and dashes."""
 

@@ -54,7 +54,7 @@ def draw_learning_curve(
 def draw_correlations(correlations: Correlations) -> Figure:
     """Draw the correlation of each input with the disturbance, beside the paper's values."""
     names, count = correlations.features, len(correlations.features)
-    figure = new_figure(WIDTH_IN, 1.5 + 0.24 * count)
+    figure = new_figure(WIDTH_IN, 1.9 + 0.24 * count)
     ax = figure.subplots()
     y, rho, sd = np.arange(count), np.nan_to_num(correlations.rho), correlations.sd
     ax.barh(y, rho, 0.7, color=DATA, alpha=0.6, label=f"{correlations.rows:,} readings")
@@ -75,5 +75,5 @@ def draw_correlations(correlations: Correlations) -> Figure:
     ax.axvline(0, color=FAINT, lw=0.8)
     label(ax, "Spearman's correlation with the disturbance")
     ax.grid(axis="x")
-    legend_below(figure)
+    legend_below(figure, columns=1)
     return figure
