@@ -117,6 +117,8 @@ class View:
             return Camera(azimuth_deg=-90.0, elevation_deg=90.0)
         if self.kind == "fixed":
             return Camera.between(self.place, self.target)
+        if self.kind == "chase":
+            raise InputError("the camera chase is for a run; a stage has none", parameter="camera")
         return Camera(azimuth_deg=40.0 + ORBIT_DEG_S * seen_s, elevation_deg=LAB_ELEVATION_DEG)
 
     @staticmethod
@@ -334,11 +336,13 @@ class Scenery:
             self._ribbons.append((mesh, actor, faces))
 
     def _aim(self, k: int) -> None:
-        camera, around = self._view.camera((self._times[k] - self._times[0]) / self._speed), self._around
+        around = self._around
+        if self._view.kind == "chase":
+            camera = self._view.behind(self._p[k], self._q[k])
+        else:
+            camera = self._view.camera((self._times[k] - self._times[0]) / self._speed)
         if self._view.kind == "top":  # with the whole map, like a picture of the stage
             around = np.vstack([around, *self._subjects])
-        elif self._view.kind == "chase":
-            camera = self._view.behind(self._p[k], self._q[k])
         aim(self.plotter, camera, around, self._size, bar=self._bar)
         self._walls.cut(self.plotter.camera.position, np.vstack([self._points, self._p[k] + _ABOVE]))
 

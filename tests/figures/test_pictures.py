@@ -138,6 +138,7 @@ def test_no_wall_or_column_hides_the_map_from_any_side(
         wall.AddScaleOp().Set((0.2 + 3 * (abs(y) == 2), 0.2 + 3 * (abs(x) == 2), 2.5))
     veiled = draw(stage, tmp_path, camera=camera, legend=False)
     monkeypatch.setattr("magtwin.figures.pictures.VEIL", 1.0)
+    monkeypatch.setattr("magtwin.figures.pictures.hides", lambda *_: False)
     solid = draw(stage, tmp_path, camera=camera, legend=False)
     inks = 255 * srgb_from_linear([(0.9, 0.05, 0.0), (0.0, 0.05, 0.9)])  # edges are mixed with what is beside
     on_map = np.any([np.abs(bare - ink).max(axis=-1) <= 2 for ink in inks], axis=0)
@@ -145,8 +146,6 @@ def test_no_wall_or_column_hides_the_map_from_any_side(
     changed = np.abs(veiled - bare)[on_map].max(axis=-1), np.abs(solid - bare)[on_map].max(axis=-1)
     assert np.mean(changed[1] > 100) > 0.2  # without the cutaway, they do
     assert changed[0].max() <= VEIL * 255 + 3
-    there = ~drawn(bare)
-    np.testing.assert_allclose(veiled[there], solid[there], atol=8)  # solid elsewhere; drawn() sees from 8 on
 
 
 DESK, CHAIR, SHELF, CABINET = "desk", "chair", "shelf", "cabinet"

@@ -32,7 +32,7 @@ def picture(
     out
         PNG to write.
     camera
-        orbit, from above at a slant; top, straight from above; or x,y,z:x,y,z, the
+        orbit, from above at a slant; top, straight from above; chase, behind the robot; or x,y,z:x,y,z, the
         camera's position and target [m]. Default: orbit.
     time_s
         Moment of a run or recording [s]. Default: the end of a run; where the viewer starts a recording.
@@ -71,7 +71,7 @@ def film(
     out
         MP4 or GIF to write.
     camera
-        orbit, slowly around the lab; top, straight from above; or x,y,z:x,y,z, the
+        orbit, slowly around the lab; top, straight from above; chase, behind the robot; or x,y,z:x,y,z, the
         camera's position and target [m].
     fps
         Frames per second [Hz].
