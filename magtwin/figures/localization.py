@@ -41,9 +41,9 @@ from magtwin.frames import quat_from_yaw, wrap_angle
 from magtwin.io.rerun.localization import write_localization
 from magtwin.tasks.localizing import Localization, truth_name
 
-DEAD_LOOK = {"color": DATA, "ls": (0, (4, 2))}
-BOUND_LOOK = {"color": BOUND, "ls": (0, (1.5, 1.2)), "lw": 1.7}
-BAND_LOOK = {"color": MODEL, "alpha": 0.22, "lw": 0}
+DEAD_LOOK: dict[str, Any] = {"color": DATA, "ls": (0, (4, 2))}
+BOUND_LOOK: dict[str, Any] = {"color": BOUND, "ls": (0, (1.5, 1.2)), "lw": 1.7}
+BAND_LOOK: dict[str, Any] = {"color": MODEL, "alpha": 0.22, "lw": 0}
 
 ELLIPSE_S = 5.0
 """Least time between ellipses [s]."""

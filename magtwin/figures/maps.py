@@ -259,11 +259,12 @@ class FloorPlan:
 
     def draw(self, ax: Axes) -> None:
         """Draw the outlines, and widen the view to hold them."""
-        for outlines, look in (
+        looks: tuple[tuple[tuple[Array, ...], dict[str, Any]], ...] = (
             (self.pieces, {"fc": FAINT, "ec": SOFT, "alpha": 0.45, "lw": 0.8}),
             (self.solids, {"fc": SOFT, "ec": SOFT, "lw": 0.6}),
             (self.doors, {"fc": "none", "ec": BOUND, "lw": 1.6}),
-        ):
+        )
+        for outlines, look in looks:
             for outline in outlines:
                 ax.add_patch(Polygon(outline, **{"zorder": 2.5, **look}))
         x0, x1, y0, y1 = self.extent((*ax.get_xlim(), *ax.get_ylim()))
@@ -278,10 +279,12 @@ class FloorPlan:
 
     def keys(self) -> dict[str, Patch]:
         """Entries of a legend."""
-        looks = {"solid near the floor": {"fc": SOFT}, "furniture": {"fc": FAINT, "ec": SOFT, "alpha": 0.45}}
-        looks |= {"door": {"fc": "none", "ec": BOUND}}
-        shown = zip(looks.items(), (self.solids, self.pieces, self.doors), strict=True)
-        return {name: Patch(**look) for (name, look), outlines in shown if outlines}
+        looks = (
+            ("solid near the floor", self.solids, Patch(fc=SOFT)),
+            ("furniture", self.pieces, Patch(fc=FAINT, ec=SOFT, alpha=0.45)),
+            ("door", self.doors, Patch(fc="none", ec=BOUND)),
+        )
+        return {name: patch for name, outlines, patch in looks if outlines}
 
 
 _ENDS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])

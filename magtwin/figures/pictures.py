@@ -112,12 +112,13 @@ class Camera:
     """Angle between the upper and the lower edge [deg]."""
 
     @classmethod
-    def between(cls, place: Vec3, target: Vec3, view_angle_deg: float = 40.0) -> "Camera":
+    def between(cls, place: ArrayLike, target: ArrayLike, view_angle_deg: float = 40.0) -> "Camera":
         """A camera at a place that looks at a target [m]."""
         back = np.subtract(place, target)
         distance = float(np.linalg.norm(back))
         turn, rise = np.degrees([np.arctan2(back[1], back[0]), np.arcsin(back[2] / distance)]).tolist()
-        return cls(turn, rise, distance, target, view_angle_deg)
+        x, y, z = np.asarray(target, float).tolist()
+        return cls(turn, rise, distance, (x, y, z), view_angle_deg)
 
     def axes(self) -> Array:
         """Right, up and back axes in world, as rows, shape (3, 3)."""
@@ -262,8 +263,9 @@ def hides(triangles: Array, place: ArrayLike, points: Array) -> bool:
     a + u e1 + v e2 if u, v >= 0 and u + v <= 1.
     """
     a, e1, e2 = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    ray = (points - place)[:, None]
-    across, off = np.cross(ray, e2), np.asarray(place, float) - a
+    eye = np.asarray(place, float)
+    ray, off = (points - eye)[:, None], eye - a
+    across = np.cross(ray, e2)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = 1.0 / (across * e1).sum(axis=-1)
         turned = np.cross(off, e1)

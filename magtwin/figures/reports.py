@@ -230,7 +230,12 @@ def page_of_check(report: Report) -> Page:
 
     def draw(ax: Axes) -> None:
         for measure, look in (("RMSE", SERIES[0]), ("MAE", SERIES[1])):
-            marker = {"marker": "o" if measure == "RMSE" else "D", "ls": "", "color": look["color"], "ms": 7}
+            marker: dict[str, Any] = {
+                "marker": "o" if measure == "RMSE" else "D",
+                "ls": "",
+                "color": look["color"],
+                "ms": 7,
+            }
             ax.plot([value(name, measure) for name in order], range(len(order)), label=measure, **marker)
         ax.set_yticks(range(len(order)), order)
         ax.set(ylim=(len(order) - 0.5, -0.5), xlim=(0, None))

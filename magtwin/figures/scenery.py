@@ -126,7 +126,7 @@ class View:
         """The chase camera of a robot at p [m], shape (3,)."""
         forward = matrix_from_quat(q_xyzw)[:, 0] * (1, 1, 0)
         place, target = p - BEHIND_M * forward + (0, 0, ABOVE_M), p + AHEAD_M * forward
-        return Camera.between((*map(float, place),), (*map(float, target),), 50.0)
+        return Camera.between(place, target, 50.0)
 
 
 KINDS = ("orbit", "top", "chase")
@@ -270,8 +270,10 @@ class Scenery:
         scale: ColourScale | None,
     ) -> None:
         """Build the lab, one body per look, and each link of the robot."""
-        placed = [_placed(shape, links[shape.link]) if shape.link else shape.vertices for shape in still]
-        placed = [vertices.astype(float) for vertices in placed]
+        placed = [
+            _placed(shape, links[shape.link]) if shape.link else shape.vertices.astype(float)
+            for shape in still
+        ]
         self._subjects = [v for s, v in zip(still, placed, strict=True) if is_subject(s, scale)]
         self._screens, self._walls, self._points = add_still(
             self.plotter, still, placed, scale, baked=not fine

@@ -157,7 +157,7 @@ def test_a_drawing_on_a_page_is_a_part_of_it_and_takes_its_colours(runs):
     names = re.findall(r'(?<=[ "])id="([^"]+)"', body)
     assert len(names) == len(set(names))
     assert set(re.findall(r"url\(#([^)]+)\)", body)) <= set(names)
-    sizes = [float(size) for size in re.findall(r"font: (?:\w+ )*([\d.]+)px", body)]
+    sizes = [float(size) for size in re.findall(r"font-size: ([\d.]+)px", body)]
     width = float(re.search(r'viewBox="0 0 ([\d.]+)', body)[1])
     assert min(sizes) * (390 - 34) / width >= 11  # as a phone shows them
     assert body.index('class="verdict"') < body.index("<svg") < body.index("<details")
