@@ -29,7 +29,7 @@ from magtwin.figures.maps import FloorPlan, map_charts
 from magtwin.figures.page import Page, Section, Table, text_of
 from magtwin.figures.player import Player, player_of
 from magtwin.figures.runs import field_name, path_picture, position_name
-from magtwin.figures.style import DATA, MODEL, SERIES, styled
+from magtwin.figures.style import DATA, MODEL, styled
 from magtwin.report.report import Report
 from magtwin.run.compare import ERRORS, Agreement, Comparison, Traversals, errors_of, terms_of
 from magtwin.run.figures import prediction_nt

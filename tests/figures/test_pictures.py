@@ -148,22 +148,13 @@ def test_no_wall_or_column_hides_the_map_from_any_side(
     assert changed[0].max() <= VEIL * 255 + 3
 
 
-DESK, CHAIR, SHELF, CABINET = "desk", "chair", "shelf", "cabinet"
 ROOMS = {
-    "walls of 2.5 m": (5, 4, [(DESK, 1.5, 1.6, -1.57), (SHELF, 2.2, -1.2, 3.14), (CABINET, -2.2, -1, 0)]),
-    "L": (
-        8,
-        6,
-        [("box", 2.5, -1.75, 0), (DESK, -3, 2.4, -1.57), (SHELF, 3.6, 1.5, 3.14), (CHAIR, -2, -1, 1)],
-    ),
-    "corridor": (12, 2, [(CABINET, -4, 0.7, -1.57), (SHELF, 4, 0.7, -1.57), (CHAIR, 2, -0.6, 1.57)]),
-    "hall": (40, 25, [(DESK, -15, -10, 1.57), (SHELF, 10, 10, -1.57), (DESK, 15, 5, 0), (CABINET, 0, 11, 0)]),
-    "cell": (3, 3, [(DESK, -0.9, 0.6, 0), (CHAIR, -0.3, 1.1, 2), (CABINET, 1.1, -0.9, 3.14)]),
-    "columns": (
-        9,
-        6,
-        [*(("column", x, y, 0) for x in (-2, 2) for y in (-1.5, 1.5)), (DESK, 3.4, -2.4, 1.57)],
-    ),
+    "walls of 2.5 m": (5, 4, "desk 1.5 1.6 -1.57, shelf 2.2 -1.2 3.14, cabinet -2.2 -1 0"),
+    "L": (8, 6, "box 2.5 -1.7 0, desk -3 2.4 -1.57, shelf 3.6 1.5 3.14, chair -2 -1 1"),
+    "corridor": (12, 2, "cabinet -4 0.7 -1.57, shelf 4 0.7 -1.57, chair 2 -0.6 1.57"),
+    "hall": (40, 25, "desk -15 -10 1.57, shelf 10 10 -1.57, desk 15 5 0, cabinet 0 11 0"),
+    "cell": (3, 3, "desk -0.9 0.6 0, chair -0.3 1.1 2, cabinet 1.1 -0.9 3.14"),
+    "columns": (9, 6, "column -2 1.5 0, column 2 1.5 0, column 2 -1.5 0, desk 3.4 -2.4 1.57"),
 }
 """Sides of the floor [m], and kind, x, y [m] and yaw [rad] of each piece. All walls are 2.5 m high."""
 
@@ -177,7 +168,8 @@ def test_furniture_is_seen_and_whole_in_rooms_with_high_walls(name, tmp_path, mo
     UsdGeom.SetStageMetersPerUnit(stage, 1)
     define_lab(stage, LabSpec(floor_m=(x, y), wall_height_m=2.5, wall_thickness_m=0.1, post_height_m=0))
     furniture = []
-    for k, (kind, px, py, yaw) in enumerate(pieces):
+    for k, (kind, *numbers) in enumerate(piece.split() for piece in pieces.split(", ")):
+        px, py, yaw = map(float, numbers)
         block = {"material": "brick", "size_m": (3.0, 2.5, 2.5)} if kind == "box" else {}
         turn = (0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
         place = {"p_world": (px, py, 0.0), "q_world_xyzw": turn}
