@@ -129,8 +129,8 @@ def draw_map(
         if quantity != "mask":
             ticks = scale.levels[:: max(1, len(scale.levels) // 8)]
             colour_bar(figure, drawn, [axes[k] for k in mine], QUANTITIES[quantity].label, ticks=ticks)
-    for ax, panel in zip(axes, panels, strict=False):
-        ax.set_visible(panel is not None)
+    for ax, shown in zip(axes, panels, strict=False):
+        ax.set_visible(shown is not None)
     if legend:
         figure.legend(legend.values(), legend.keys(), loc="outside lower right", ncols=3)
     if not several:

@@ -229,14 +229,9 @@ def page_of_check(report: Report) -> Page:
     rows = tuple((name, *(value(name, measure) for measure in measures)) for name in order)
 
     def draw(ax: Axes) -> None:
-        for measure, look in (("RMSE", SERIES[0]), ("MAE", SERIES[1])):
-            marker: dict[str, Any] = {
-                "marker": "o" if measure == "RMSE" else "D",
-                "ls": "",
-                "color": look["color"],
-                "ms": 7,
-            }
-            ax.plot([value(name, measure) for name in order], range(len(order)), label=measure, **marker)
+        for measure, ink, marker in (("RMSE", DATA, "o"), ("MAE", MODEL, "D")):
+            sizes = [value(name, measure) for name in order]
+            ax.plot(sizes, range(len(order)), color=ink, marker=marker, ls="", ms=7, label=measure)
         ax.set_yticks(range(len(order)), order)
         ax.set(ylim=(len(order) - 0.5, -0.5), xlim=(0, None))
         ax.grid(axis="both")

@@ -51,7 +51,7 @@ ORBIT_DEG_S = 5.0
 TRAIL_STEP_M = 0.01
 """Step of the trail [m]."""
 
-TRAIL = ((0.065, 0.008, (32, 38, 45)), (0.053, 0.011, (255, 255, 255)), (0.038, 0.014, None))
+TRAIL = ((0.067, 0.008, (32, 38, 45)), (0.053, 0.011, (255, 255, 255)), (0.029, 0.014, None))
 """Half width [m], height above the floor [m] and colour of the trail's dark edge, white edge and middle. The
 middle tells what the map lacks; one of the two edges differs from any colour of the map below."""
 
