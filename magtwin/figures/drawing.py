@@ -13,12 +13,12 @@ Show = Literal["charts", "picture", "field", "gradient", "variance", "mask", "he
 
 FILMS = (".mp4", ".gif")
 PHOTOS = (".jpg", ".jpeg")
-SUFFIXES = {"chart": (".png", ".svg", *PHOTOS), "picture": (".png", *PHOTOS), "film": FILMS}
+SUFFIXES = {"chart": (".png", ".svg", *PHOTOS), "map": (".png", ".svg", *PHOTOS, ".html"), "picture": (".png", *PHOTOS), "film": FILMS}
 
 WAYS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "charts": ("chart", "charts of a run", ("scene",)),
     "comparison": ("chart", "charts of two runs", ()),
-    "map": ("chart", "a map", ("headings",)),
+    "map": ("map", "a map", ("headings",)),
     "difference": ("chart", "the difference of two maps", ()),
     "moment": ("picture", "a moment of a run in its lab", ("at_s", "camera", "size", "scene")),
     "recording": ("picture", "a recording in the viewer", ("at_s", "size")),
@@ -44,8 +44,8 @@ def draw(
         out: File to write; its suffix says whether it is a picture or a film. None: a PNG in the working
             folder, named after the first file.
         show: What to draw of a run (charts, picture) or of a map and the map of a stage. None: charts of a
-            run unless `at_s` or `camera` asks for a picture; a recording as the Rerun viewer shows it; the
-            field of a map; a stage as it looks.
+            run unless `at_s` or `camera` asks for a picture; a recording as the Rerun viewer shows it; mean,
+            heading effect, standard deviation and gradient of a map; a stage as it looks.
         force: Whether an existing output is replaced.
         advance: Called with the frames of a film that are drawn, and their number.
         options: at_s [s], camera, size [pixels], scene, headings [rad], pace and fps, as far as what is drawn
@@ -136,18 +136,14 @@ def _draw(
 
     if way == "comparison":
         views.compare_files(*paths, out=out, force=force)
-    elif way in ("map", "difference"):
+    elif way == "map":
+        views.plot_maps(paths, out, quantity=show or "overview", headings=given.get("headings"), force=force)
+    elif way == "difference":
         from magtwin.field.maps.difference import difference
-        from magtwin.figures.maps import draw_difference, draw_map
+        from magtwin.figures.maps import draw_difference
         from magtwin.io.map_files import open_map
 
-        fields = [open_map(path) for path in paths]
-        figure = (
-            draw_difference(difference(*fields))
-            if way == "difference"
-            else draw_map(fields[0], what=show or "field", headings=given.get("headings"))
-        )
-        save(figure, out, force=force)
+        save(draw_difference(difference(*map(open_map, paths))), out, force=force)
     elif way == "charts":
         save(_charts(paths[0], given.get("scene")), out, force=force)
     elif way == "film":

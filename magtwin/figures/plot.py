@@ -17,19 +17,20 @@ def plot(
     what: Run | AnomalyMap,
     *,
     anomaly_map: AnomalyMap | None = None,
-    quantity: str = "field",
+    quantity: str = "overview",
     headings: Sequence[float] | None = None,
 ) -> Figure:
     """Draw a run or a map.
 
-    A run: the path over the floor, coloured by the field, and field, disturbance, speed and battery against
-    time, of those columns that it has. A map: filled contours, one panel per heading.
+    A run: the path over the floor, coloured by the reading less the map, and against time what the map lacks,
+    the error of the prediction, the field, speed and battery, of those columns that it has. A map: filled
+    contours of its mean, heading effect, standard deviation and gradient.
 
     Args:
         what: A `Run` or an `AnomalyMap`.
         anomaly_map: For a run: the map to draw below the path, as the mean over its headings. None draws a
             bare floor.
-        quantity: For a map: "field", "gradient", "variance", "mask" or "headings"; see
+        quantity: For a map: "overview", "field", "gradient", "variance", "mask" or "headings"; see
             `magtwin.figures.maps.draw_map`.
         headings: For a map: headings to show [rad]. None shows the map's own, or about four of more than
             eight.

@@ -12,18 +12,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
 from magtwin.figures.pictures import (
     BACKGROUND,
     LAB_ELEVATION_DEG,
     Camera,
     Cutaway,
     add_bar,
+    add_still,
     add_text,
     aim,
-    bake,
     check_png,
     check_size,
+    inside,
     is_subject,
     joined,
     light,
@@ -33,6 +33,7 @@ from magtwin.figures.pictures import (
     style_of,
     write_png,
 )
+from magtwin.figures.runs import Trail
 from magtwin.files.outputs import output
 from magtwin.frames import matrix_from_quat, quat_from_yaw
 from magtwin.run.compare import FIELDS, HEADINGS, POSITIONS
@@ -50,9 +51,17 @@ ORBIT_DEG_S = 5.0
 TRAIL_STEP_M = 0.01
 """Step of the trail [m]."""
 
-TRAIL = ((0.065, 0.008, (32, 38, 45)), (0.05, 0.011, (255, 255, 255)), (0.026, 0.014, None))
+TRAIL = ((0.067, 0.008, (32, 38, 45)), (0.053, 0.011, (255, 255, 255)), (0.029, 0.014, None))
 """Half width [m], height above the floor [m] and colour of the trail's dark edge, white edge and middle. The
-middle has the colours of the field, as has the map below; one of the two edges differs from any of them."""
+middle tells what the map lacks; one of the two edges differs from any colour of the map below."""
+
+NEAR_M = 2.5
+"""Distance from a path up to which all that stands there is in view, whole [m]."""
+
+BEHIND_M, ABOVE_M, AHEAD_M = 1.8, 1.1, 0.8
+"""Place of the chase camera behind and above the robot, and of its target ahead of it [m]."""
+
+_ABOVE = np.array([0.0, 0.0, 0.2])
 
 TRAIL_SPAN_M = 6.0
 """Extent of a path above which its trail is wider, to stay visible from farther away [m]."""
@@ -69,7 +78,7 @@ class View:
     """A camera for a run."""
 
     kind: str
-    """"top", "orbit", or "fixed"."""
+    """"orbit", "top", "chase", or "fixed"."""
 
     place: Vec3 = (0.0, 0.0, 0.0)
     """Position of a fixed camera [m]."""
@@ -107,20 +116,21 @@ class View:
         if self.kind == "top":
             return Camera(azimuth_deg=-90.0, elevation_deg=90.0)
         if self.kind == "fixed":
-            back = np.subtract(self.place, self.target)
-            distance = float(np.linalg.norm(back))
-            return Camera(
-                azimuth_deg=math.degrees(math.atan2(back[1], back[0])),
-                elevation_deg=math.degrees(math.asin(back[2] / distance)),
-                distance_m=distance,
-                target=self.target,
-                view_angle_deg=40.0,
-            )
+            return Camera.between(self.place, self.target)
+        if self.kind == "chase":
+            raise InputError("the camera chase is for a run; a stage has none", parameter="camera")
         return Camera(azimuth_deg=40.0 + ORBIT_DEG_S * seen_s, elevation_deg=LAB_ELEVATION_DEG)
 
+    @staticmethod
+    def behind(p: Array, q_xyzw: ArrayLike) -> Camera:
+        """The chase camera of a robot at p [m], shape (3,)."""
+        forward = matrix_from_quat(q_xyzw)[:, 0] * (1, 1, 0)
+        place, target = p - BEHIND_M * forward + (0, 0, ABOVE_M), p + AHEAD_M * forward
+        return Camera.between(place, target, 50.0)
 
-KINDS = ("orbit", "top")
-"""From above at a slant, slowly round the lab; straight from above, x to the right."""
+
+KINDS = ("orbit", "top", "chase")
+"""From above at a slant, slowly round the lab; straight from above, x to the right; behind the robot."""
 
 
 class Scenery:
@@ -172,7 +182,7 @@ class Scenery:
         try:
             scale = read_colour_scale(stage)
             self._build(still, links, [s for s in shapes if s.link in moving], moving, fine, scale)
-            self._build_trail(run, (scale.least, scale.greatest) if scale else None)
+            self._build_trail(run, scale)
             light(self.plotter, self._everything, soft=fine)
             if not fine:
                 self.plotter.disable_anti_aliasing()
@@ -244,7 +254,7 @@ class Scenery:
         fast = f"   x{self._speed:.3g}" if self._speed != 1 else ""
         words = [f"{t - run['t'][0]:.1f} s" for t in self._times]
         if field:
-            words = [f"{w}   {b / 1000:.2f} µT" for w, b in zip(words, seen[field], strict=True)]
+            words = [f"{w}   {b:,.0f} nT" for w, b in zip(words, seen[field], strict=True)]
         if "v_base" in seen:
             speeds = np.round(seen["v_base"][:, 0], 2) + 0.0  # no "-0.00"
             words = [f"{w}   {v:.2f} m/s" for w, v in zip(words, speeds, strict=True)]
@@ -260,20 +270,15 @@ class Scenery:
         scale: ColourScale | None,
     ) -> None:
         """Build the lab, one body per look, and each link of the robot."""
-        bodies: dict[tuple[bool, bool, float], list[Any]] = {}
-        placed = [_placed(shape, links[shape.link]) if shape.link else shape.vertices for shape in still]
+        placed = [
+            _placed(shape, links[shape.link]) if shape.link else shape.vertices.astype(float)
+            for shape in still
+        ]
         self._subjects = [v for s, v in zip(still, placed, strict=True) if is_subject(s, scale)]
-        for shape, vertices in zip(still, placed, strict=True):
-            mesh, flat = mesh_of(shape, vertices), shape.vertex_colours is not None
-            if not flat and not fine:  # lighting it in each frame would double the work
-                bake(mesh)
-                flat = True
-            bodies.setdefault((is_subject(shape, scale), flat, shape.colour[3]), []).append(mesh)
-        self._screens = []
-        for (subject, flat, opacity), meshes in bodies.items():
-            actor = self.plotter.add_mesh(joined(meshes), opacity=opacity, **style_of(flat))
-            if not subject:
-                self._screens.append(actor)
+        self._screens, self._walls, self._points = add_still(
+            self.plotter, still, placed, scale, baked=not fine
+        )
+        self._things = inside(still, placed)
         self._actors: dict[str, Any] = {}
         self._links: dict[str, Link] = {}
         for name, link in moving.items():
@@ -284,14 +289,18 @@ class Scenery:
             self._links[name] = link
         self._everything = np.vstack([*placed, self._p]).astype(float)
 
-    def _build_trail(self, run: Run, limits: tuple[float, float] | None) -> None:
-        """Build the whole trail, coloured by the field; a frame shows the part driven so far."""
+    def _build_trail(self, run: Run, scale: ColourScale | None) -> None:
+        """Build the whole trail, coloured as in a chart; a frame shows the part driven so far."""
         import pyvista
         from matplotlib import colormaps
 
         p_xy = run[self._position][:, :2]
         rows = _steps(p_xy)
-        self._around = room_above(np.column_stack([p_xy[rows], np.zeros(len(rows))]))
+        box = room_above(np.column_stack([p_xy[rows], np.zeros(len(rows))]))
+        low, high = box.min(axis=0) - NEAR_M, box.max(axis=0) + NEAR_M
+        reach = [(v, (v.max(axis=0) > low) & (v.min(axis=0) < high)) for v in self._things]
+        near = [v for v, overlaps in reach if overlaps[:2].all()]
+        self._around = np.vstack([box, *near])
         wider = max(1.0, float(np.max(np.ptp(p_xy[rows], axis=0))) / TRAIL_SPAN_M)
         rows = rows[: int(np.searchsorted(run["t"][rows], self._times[-1], side="right"))]
         self._trail_t, self._ribbons = run["t"][rows], []
@@ -299,13 +308,21 @@ class Scenery:
         if len(rows) < 2:
             return
         colours = np.tile(np.array(UNKNOWN, np.uint8), (len(rows), 1))
+        limits = None if scale is None else (scale.least, scale.greatest)
         if self._field:
-            b = run[self._field][rows]
-            low, high = limits or colour_limits(b)
-            known = np.isfinite(b)
-            share = (b[known] - low) / max(high - low, 1e-9)
-            colours[known] = (255 * colormaps[COLOUR_MAP](share)[:, :3]).round().astype(np.uint8)
-            add_bar(self.plotter, COLOUR_MAP, low, high, "nT")
+            trail = Trail.of(run, limits)
+            low, high = trail.limits
+            known = np.isfinite(trail.values[rows])
+            share = (trail.values[rows][known] - low) / max(high - low, 1e-9)
+            colours[known] = (255 * colormaps[trail.colours](share)[:, :3]).round().astype(np.uint8)
+            two = scale is not None and limits != trail.limits
+            add_bar(
+                self.plotter, trail.colours, trail.limits, trail.name.replace(" − ", "\n− "), "lower" * two
+            )
+            if scale is not None and two:
+                add_bar(
+                    self.plotter, scale.name, (scale.least, scale.greatest), f"map [{scale.unit}]", "upper"
+                )
         along = np.gradient(p_xy[rows], axis=0)
         along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
         left = np.column_stack([-along[:, 1], along[:, 0]])
@@ -321,10 +338,15 @@ class Scenery:
             self._ribbons.append((mesh, actor, faces))
 
     def _aim(self, k: int) -> None:
-        camera, around = self._view.camera((self._times[k] - self._times[0]) / self._speed), self._around
+        around = self._around
+        if self._view.kind == "chase":
+            camera = self._view.behind(self._p[k], self._q[k])
+        else:
+            camera = self._view.camera((self._times[k] - self._times[0]) / self._speed)
         if self._view.kind == "top":  # with the whole map, like a picture of the stage
             around = np.vstack([around, *self._subjects])
         aim(self.plotter, camera, around, self._size, bar=self._bar)
+        self._walls.cut(self.plotter.camera.position, np.vstack([self._points, self._p[k] + _ABOVE]))
 
 
 def picture_of_run(

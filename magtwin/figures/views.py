@@ -9,8 +9,15 @@ from typing import Any, Literal
 
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.figures.canvas import save
+from magtwin.figures.maps import FloorPlan, draw_map
 from magtwin.figures.page import write_page
-from magtwin.figures.reports import NamedRun, draw_comparison, page_of_runs
+from magtwin.figures.reports import (
+    NamedRun,
+    draw_comparison,
+    page_of_comparison,
+    page_of_maps,
+    page_of_runs,
+)
 from magtwin.files.file import existing
 from magtwin.files.outputs import check_free
 from magtwin.io.convert import twin_to_show
@@ -162,7 +169,7 @@ def compare_files(
         a: First run, in any format.
         b: Second run.
         align: As for `magtwin.run.compare.compare`.
-        out: Picture to draw (.png, .svg).
+        out: Picture (.png, .svg) or page (.html) to write.
         force: Whether an existing output is replaced.
 
     Raises:
@@ -173,8 +180,61 @@ def compare_files(
     named = NamedRun(name_a, read_run(a)), NamedRun(name_b, read_run(b))
     comparison = compare(named[0].run, named[1].run, align=align)
     if out is not None:
-        save(draw_comparison(*named, comparison), out, force=force)
+        if Path(out).suffix.lower() == ".html":
+            write_page(page_of_comparison(*named, comparison), out, force=force)
+        else:
+            save(draw_comparison(*named, comparison), out, force=force)
     return comparison
+
+
+def plot_maps(
+    files: Sequence[Source],
+    out: Source,
+    *,
+    quantity: str = "overview",
+    headings: Sequence[float] | None = None,
+    force: bool = False,
+) -> None:
+    """Draw maps as a picture or a page, with what stands on the floor if the scene of the first is at hand.
+
+    Args:
+        files: Up to four maps, as for `magtwin.io.map_files.open_map`; several are drawn on common scales.
+        out: Picture (.png, .svg) or page (.html) to write.
+        quantity: As for `magtwin.figures.maps.draw_map`; a page has the overview.
+        headings: Headings to show [rad], or None.
+        force: Whether an existing output is replaced.
+
+    Raises:
+        InputError: A map cannot be read or drawn, or the output cannot be written.
+    """
+    from magtwin.io.map_files import open_map
+
+    fields, plan = [open_map(file) for file in files], floor_plan(files[0])
+    if Path(out).suffix.lower() == ".html":
+        write_page(page_of_maps(fields, plan), out, force=force)
+    else:
+        save(draw_map(fields, what=quantity, headings=headings, plan=plan), out, force=force)
+
+
+def floor_plan(source: Source) -> FloorPlan | None:
+    """What stands on the floor of a map: by its stage, or by the stage beside it, if that reads this map."""
+    from magtwin.files.file import shipped
+    from magtwin.io.map_files import map_file
+    from magtwin.usd.scene import open_scene
+
+    path = map_file(source)
+    folders = [path.parent, path.parent.parent, shipped("scenes") / path.resolve().parent.name]
+    stages = [path, *(folder / f"{folder.resolve().name}.usda" for folder in folders)]
+    for stage in stages:
+        if not stage.is_file():
+            continue
+        try:
+            opened = open_scene(stage, check_network=False)
+        except InputError:  # a layer without a lab
+            continue
+        if stage == path or opened.scene.map_layer.resolve() == path.resolve():
+            return FloorPlan.of(opened.scene, opened.obstacles)
+    return None
 
 
 def names_of(a: Path, b: Path) -> tuple[str, str]:

@@ -160,7 +160,7 @@ def test_the_commands_draw_a_moment_a_film_and_a_stage(run, lab_scene, tmp_path,
 @pytest.mark.parametrize(
     ("options", "what"),
     [
-        ({"camera": "sideways"}, "no camera 'sideways'; known: orbit, top; or x,y,z:x,y,z"),
+        ({"camera": "sideways"}, "no camera 'sideways'; known: orbit, top, chase; or x,y,z:x,y,z"),
         ({"camera": "1,2,3:4,5"}, "no camera '1,2,3:4,5'"),
         ({"camera": "1,2,3,4,5,6"}, "no camera '1,2,3,4,5,6'"),
         ({"camera": "nan,2,3:4,5,6"}, "no camera 'nan,2,3:4,5,6'"),

@@ -10,8 +10,10 @@ import pytest
 from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.figures.page import Page, to_html, to_json, write_page
-from magtwin.figures.reports import NamedRun, page_of_runs
+from magtwin.figures.reports import NamedRun, page_of_comparison, page_of_runs
+from magtwin.figures.style import PALETTE
 from magtwin.io.tables import write_parquet
+from magtwin.run.compare import compare
 from magtwin.run.run import Run
 from magtwin.twin import open_twin, simulate
 
@@ -138,3 +140,26 @@ def test_what_cannot_be_reported_is_refused_and_nothing_is_written(runs, tmp_pat
         page_of_runs([NamedRun("empty", empty)])
     assert [p.name for p in tmp_path.iterdir()] == ["there.html"]
     assert (tmp_path / "there.html").read_text() == "precious"
+
+
+def test_a_drawing_on_a_page_is_a_part_of_it_and_takes_its_colours(runs):
+    a, b = (NamedRun(name, run) for name, run in zip("ab", runs, strict=True))
+    page = page_of_comparison(a, b, compare(a.run, b.run))
+    text = to_html(page)
+    read = Reader(text)
+    assert read.open == []
+    drawings = [attributes for tag, attributes in read.tags if tag == "svg"]
+    assert len(drawings) == len(page.sections[0].pictures) == 4
+    assert all(drawing["aria-label"] for drawing in drawings)
+    body = text[text.index("<body") :]
+    light = {colour for colour, _ in PALETTE.values() if colour.startswith("#")}
+    assert light.isdisjoint(re.findall("#[0-9a-f]{6}", body))
+    names = re.findall(r'(?<=[ "])id="([^"]+)"', body)
+    assert len(names) == len(set(names))
+    assert set(re.findall(r"url\(#([^)]+)\)", body)) <= set(names)
+    sizes = [float(size) for size in re.findall(r"font-size: ([\d.]+)px", body)]
+    width = float(re.search(r'viewBox="0 0 ([\d.]+)', body)[1])
+    assert min(sizes) * (390 - 34) / width >= 11  # as a phone shows them
+    assert body.index('class="verdict"') < body.index("<svg") < body.index("<details")
+    field = next(row for row in compare(a.run, b.run).agreements() if row.name == "b_measured_nt")
+    assert f"b_measured_nt by {field.rms:,.1f} nT (RMS)" in page.verdict

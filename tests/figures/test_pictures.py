@@ -6,9 +6,14 @@ import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from magtwin.errors import InputError
+from magtwin.figures import pictures
 from magtwin.figures.pictures import BACKGROUND, VEIL, Camera, picture_of_stage
+from magtwin.spec.furniture import FurnitureSpec
+from magtwin.spec.lab import LabSpec
 from magtwin.usd.geometry import srgb_from_linear
 from magtwin.usd.info import info_of_stage
+from magtwin.usd.lab.furniture import define_furniture
+from magtwin.usd.lab.room import define_lab
 
 SIZE = (240, 160)
 BEHIND = np.array([int(BACKGROUND[i : i + 2], 16) for i in (1, 3, 5)])
@@ -133,6 +138,7 @@ def test_no_wall_or_column_hides_the_map_from_any_side(
         wall.AddScaleOp().Set((0.2 + 3 * (abs(y) == 2), 0.2 + 3 * (abs(x) == 2), 2.5))
     veiled = draw(stage, tmp_path, camera=camera, legend=False)
     monkeypatch.setattr("magtwin.figures.pictures.VEIL", 1.0)
+    monkeypatch.setattr("magtwin.figures.pictures.hides", lambda *_: False)
     solid = draw(stage, tmp_path, camera=camera, legend=False)
     inks = 255 * srgb_from_linear([(0.9, 0.05, 0.0), (0.0, 0.05, 0.9)])  # edges are mixed with what is beside
     on_map = np.any([np.abs(bare - ink).max(axis=-1) <= 2 for ink in inks], axis=0)
@@ -140,8 +146,66 @@ def test_no_wall_or_column_hides_the_map_from_any_side(
     changed = np.abs(veiled - bare)[on_map].max(axis=-1), np.abs(solid - bare)[on_map].max(axis=-1)
     assert np.mean(changed[1] > 100) > 0.2  # without the cutaway, they do
     assert changed[0].max() <= VEIL * 255 + 3
-    there = ~drawn(bare)
-    np.testing.assert_allclose(veiled[there], solid[there], atol=8)  # solid elsewhere; drawn() sees from 8 on
+
+
+ROOMS = {
+    "walls of 2.5 m": (5, 4, "desk 1.5 1.6 -1.57, shelf 2.2 -1.2 3.14, cabinet -2.2 -1 0"),
+    "L": (8, 6, "box 2.5 -1.7 0, desk -3 2.4 -1.57, shelf 3.6 1.5 3.14, chair -2 -1 1"),
+    "corridor": (12, 2, "cabinet -4 0.7 -1.57, shelf 4 0.7 -1.57, chair 2 -0.6 1.57"),
+    "hall": (40, 25, "desk -15 -10 1.57, shelf 10 10 -1.57, desk 15 5 0, cabinet 0 11 0"),
+    "cell": (3, 3, "desk -0.9 0.6 0, chair -0.3 1.1 2, cabinet 1.1 -0.9 3.14"),
+    "columns": (9, 6, "column -2 1.5 0, column 2 1.5 0, column 2 -1.5 0, desk 3.4 -2.4 1.57"),
+}
+"""Sides of the floor [m], and kind, x, y [m] and yaw [rad] of each piece. All walls are 2.5 m high."""
+
+
+@pytest.mark.parametrize("name", ROOMS)
+def test_furniture_is_seen_and_whole_in_rooms_with_high_walls(name, tmp_path, monkeypatch):
+    """Furniture is drawn in red, the rest in green; then furniture alone, by the same camera."""
+    x, y, pieces = ROOMS[name]
+    stage = Usd.Stage.CreateNew(str(tmp_path / "room.usda"))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1)
+    define_lab(stage, LabSpec(floor_m=(x, y), wall_height_m=2.5, wall_thickness_m=0.1, post_height_m=0))
+    furniture = []
+    for k, (kind, *numbers) in enumerate(piece.split() for piece in pieces.split(", ")):
+        px, py, yaw = map(float, numbers)
+        block = {"material": "brick", "size_m": (3.0, 2.5, 2.5)} if kind == "box" else {}
+        turn = (0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
+        place = {"p_world": (px, py, 0.0), "q_world_xyzw": turn}
+        furniture.append(FurnitureSpec(name=f"{kind}_{k}", kind=kind, **place, **block))
+    define_furniture(stage, tuple(furniture))
+    stage.Save()
+
+    def is_furniture(shape):
+        return "/Furniture/" in shape.prim and "box_" not in shape.prim
+
+    def coloured(shape, vertices, of=pictures.mesh_of):
+        mesh = of(shape, vertices)
+        mesh["rgb"] = np.tile(
+            np.uint8([255, 0, 0] if is_furniture(shape) else [0, 255, 0]), (mesh.n_points, 1)
+        )
+        return mesh
+
+    def reds(camera=None):
+        plotter = pictures.plotter_of((400, 250))
+        screens = pictures._draw(plotter, tmp_path / "room.usda", (400, 250), None)
+        plotter.camera = camera or plotter.camera
+        plotter.renderer.ResetCameraClippingRange()
+        shown = pictures.Cutaway(plotter, (400, 250), screens).image().astype(int)
+        camera = plotter.camera.copy()
+        plotter.close()
+        return (shown[..., 0] > 120) & (shown[..., 1] < 120), camera
+
+    monkeypatch.setattr(pictures, "mesh_of", coloured)
+    monkeypatch.setattr(pictures, "style_of", lambda flat, of=pictures.style_of: of(True))
+    monkeypatch.setattr(pictures, "light", lambda *_, **__: None)
+    seen, camera = reds()
+    every = pictures.read_shapes
+    monkeypatch.setattr(pictures, "read_shapes", lambda stage: [s for s in every(stage) if is_furniture(s)])
+    alone, _ = reds(camera)
+    assert seen.sum() >= 0.8 * alone.sum() > 16
+    assert not any(edge.any() for edge in (alone[0], alone[-1], alone[:, 0], alone[:, -1]))  # whole
 
 
 def test_what_cannot_be_drawn_is_refused(stage, tmp_path):

@@ -170,6 +170,8 @@ def map_validate(
     kernel: Kernel = None,
     earth: Earth = None,
     keep_stuck: KeepStuck = False,
+    out: Path | None = None,
+    force: Force = False,
 ) -> Done:
     """Measure how well each method predicts readings that were left out of its fit.
 
@@ -182,9 +184,12 @@ def map_validate(
     split
         What is left out at a time: every other node, one heading, one run, or blocks of the floor. Default:
         nodes of a gridded survey, runs if there are several, else blocks.
+    out
+        Page to write (.html): the best method first, and the errors of all of them.
     """
     from magtwin.io.surveys.maps import validate_methods
 
+    page = None if out is None else named(out, (".html",), "a page", force=force)
     with _as_imported(sources), progress("Predicting the readings left out") as advance:
         report = validate_methods(
             sources,
@@ -195,8 +200,13 @@ def map_validate(
             keep_stuck=keep_stuck,
             progress=advance,
         )
+    if page is not None:
+        from magtwin.figures.page import write_page
+        from magtwin.figures.reports import page_of_check
+
+        write_page(page_of_check(report), page, force=force)
     best = ("magtwin", "map", "fit", *sources, "--out", "map.usdc")
-    return Done(report, next=(best,))
+    return Done(report, page or (), next=(best,))
 
 
 @map_app.command(name="survey")

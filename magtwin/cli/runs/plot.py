@@ -37,17 +37,18 @@ def plot(
         A run in any format that magtwin reads, a stage, a map (layer, or folder of survey CSVs), or the name
         of a scene that ships with magtwin: lab. Two runs or two maps are compared.
     out
-        Picture (.png, .jpg; .svg of charts and maps) or film (.mp4, .gif) to write. Default: a .png named
+        Picture (.png, .jpg; .svg of charts and maps), page (.html of maps) or film (.mp4, .gif) to write. Default: a .png named
         after the file.
     show
-        Of a run: charts, or a picture of its end. Of a map, or a stage's map: the field, its gradient along
-        the floor, its standard deviation (variance), the masked nodes (mask), or each heading minus the mean
-        of all (headings).
+        Of a run: charts, or a picture of its end. Of a map, or a stage's map, by heading: the field, its
+        gradient along the floor, its standard deviation (variance), the masked nodes (mask), or each heading
+        minus the mean of all (headings). Default of a map: the mean, the heading's effect, the standard
+        deviation and the gradient.
     at_s
         Moment of a run or recording to draw [s].
     camera
-        orbit, from above at a slant; top, straight from above; or x,y,z:x,y,z, the camera's position and
-        target [m]. Default: orbit.
+        orbit, from above at a slant; top, straight from above; chase, behind the robot; or x,y,z:x,y,z, the
+        camera's position and target [m]. Default: orbit.
     headings_deg
         Headings of a map to draw [deg], such as 0,90,180,270. Default: the map's, or four of more than eight.
     size

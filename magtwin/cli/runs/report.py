@@ -62,12 +62,12 @@ def compare(
         time: shift the clocks so that the positions agree best. path: align by distance driven, for runs of
         different speeds. none: keep the clocks.
     out
-        Picture to draw (.png, .svg): readings as recorded and aligned, the distance between the runs, and
-        both paths.
+        Picture (.png, .svg) or page (.html) to write: readings as recorded and aligned, the distance between
+        the runs, and both paths.
     """
     from magtwin.figures.views import compare_files, names_of
 
-    out = out and named(out, (".png", ".svg"), "a comparison", force=force)
+    out = out and named(out, (".png", ".svg", ".html"), "a comparison", force=force)
     step("Comparing the runs")
     comparison = compare_files(a, b, align=align, out=out, force=force)
     lines, draw = _lines(comparison, names_of(a, b)), ("magtwin", "plot", a, b, "--out", "difference.png")

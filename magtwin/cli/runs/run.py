@@ -272,12 +272,14 @@ def _run_one(
 
 
 def save_picture(driven: "Driven", out: Path, force: bool) -> None:
-    """Draw run.png: the path over the map."""
+    """Draw run.png: the path over the map, and what the map lacks along it."""
     from magtwin.figures.canvas import save
+    from magtwin.figures.maps import FloorPlan
     from magtwin.figures.runs import draw_run
 
     planned = driven.planned.p_xy if driven.planned else None
-    save(draw_run(driven.run, driven.twin.field, planned), out, force=force)
+    plan = FloorPlan.of(driven.twin.scene, driven.twin.obstacles)
+    save(draw_run(driven.run, driven.twin.field, planned, plan), out, force=force)
 
 
 def _run_robots(

@@ -254,11 +254,11 @@ class AnomalyMap(Summarized):
             self._check_outside(np.array([[x, y]]), outside)
         return self._lookup.at_with_gradient(x, y, yaw, clamp=outside == "clamp")
 
-    def plot(self, quantity: str = "field", headings: Sequence[float] | None = None) -> "Picture":
-        """Draw the map as filled contours, one panel per heading; see `magtwin.plot`.
+    def plot(self, quantity: str = "overview", headings: Sequence[float] | None = None) -> "Picture":
+        """Draw the map as filled contours; see `magtwin.plot`.
 
         Args:
-            quantity: "field", "gradient", "variance", "mask" or "headings".
+            quantity: "overview", "field", "gradient", "variance", "mask" or "headings".
             headings: Headings to show [rad]. None: the map's own, at most four if there are more than eight.
 
         Returns:
