@@ -1,7 +1,7 @@
 """Reports: one run or several as a page; two runs compared; and one path driven twice."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from magtwin.figures.canvas import (
     short_pair,
 )
 from magtwin.figures.page import Page, Section, Table
-from magtwin.figures.player import Player, player_of
+from magtwin.figures.player import player_of
 from magtwin.figures.runs import field_name, path_picture, position_name
 from magtwin.run.compare import ERRORS, Agreement, Comparison, Traversals, errors_of, terms_of
 from magtwin.run.figures import prediction_nt
@@ -92,7 +92,9 @@ def page_of_runs(
         advance(k + 1)
     if len(runs) == 1:
         lead = runs[0].run.report().verdict or _sentence(runs[0].run)
-        player = _player(runs[0]) if pictures else None
+        still = path_picture(runs[0].run, runs[0].field, runs[0].planned)
+        data = b"" if still is None else still.data
+        player = player_of([runs[0].run], runs[0].field, runs[0].stage, still=data) if pictures else None
         return Page(_title(runs[0]), lead, (sections[0],), player=player)
     head = ("run", "path", "seed", "readings", "duration [s]", "distance [m]", "MAE [nT]", "RMS [nT]")
     note = "MAE and RMS: error of b_measured_nt against the exact field, where that is known."
@@ -148,17 +150,6 @@ def _section(named: NamedRun, pictures: bool) -> Section:
     drawn = path_picture(run, named.field, named.planned) if pictures else None
     lead = f"{named.name}: {_sentence(run)} {named.note}".strip()
     return Section(_title(named), lead, () if drawn is None else (drawn,), tuple(tables))
-
-
-def _player(named: NamedRun) -> Player:
-    """What plays a run; its charts and map alone if its scene cannot be shown, and why."""
-    still = path_picture(named.run, named.field, named.planned)
-    options: Any = {"still": b"" if still is None else still.data}
-    try:
-        return player_of(named.run, named.field, named.stage, **options)
-    except InputError as error:
-        player = player_of(named.run, named.field, None, **options)
-        return replace(player, note=f"The scene is not shown: {error}. {player.note}".strip())
 
 
 def _overview(named: NamedRun) -> tuple[Any, ...]:
