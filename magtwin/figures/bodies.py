@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.errors import InputError
 from magtwin.figures.scenery import links_of, placed, sides_of
 from magtwin.run.run import Run
 from magtwin.usd.geometry import Link, Shape, read_links, read_shapes, srgb_from_linear
+from magtwin.usd.layers import open_stage
 from magtwin.usd.scene import open_scene
 
 Array = NDArray[Any]
@@ -25,9 +27,7 @@ MAP_PRIM = "/AnomalyMap"
 """Part of the paths of prims that the page draws itself, as its floor."""
 
 
-def bodies_of(
-    arrays: dict[str, Array], stage: Path, runs: Sequence[Run]
-) -> tuple[list[dict[str, Any]], int]:
+def bodies_of(arrays: dict[str, Array], stage: Path, runs: Sequence[Run]) -> tuple[list[dict[str, Any]], int]:
     """The bodies of a scene, and the number of shapes that are left out.
 
     Adds the points of each body to `arrays`, in 1/65535 of its box, its faces and colours.
@@ -38,17 +38,28 @@ def bodies_of(
         runs: The robots that move, in the order of the page. None move without a run.
 
     Returns:
-        Boxes of the bodies; the number of its robot if a body moves; and side, pose and axis of a wheel.
+        Boxes of the bodies; whether it is part of a robot, `solid`; the number of its robot if a body moves;
+        and side, pose and axis of a wheel.
     """
-    opened = open_scene(stage, check_network=False, lab=str(runs[0].metadata.get("lab", "")) if runs else "")
-    links, names = read_links(opened.stage), [placed.robot.name for placed in opened.scene.robots]
+    try:
+        opened = open_scene(
+            stage, check_network=False, lab=str(runs[0].metadata.get("lab", "")) if runs else ""
+        )
+        shown, scene = opened.stage, opened.scene
+    except InputError:
+        if runs:
+            raise
+        shown, scene = open_stage(stage), None
+    links, names = read_links(shown), [placed.robot.name for placed in scene.robots] if scene else []
     robots = {link: k for k, run in enumerate(runs) for link in links_of(links, names, run)}
-    sides = [sides_of(opened.scene, run) for run in runs]
+    sides = [sides_of(scene, run) for run in runs if scene is not None]
     bodies: dict[str, list[tuple[Shape, Array, Array]]] = {}
     about: dict[str, dict[str, Any]] = {}
-    shapes = [s for s in read_shapes(opened.stage) if MAP_PRIM not in s.prim and len(s.faces)]
+    shapes = [s for s in read_shapes(shown) if MAP_PRIM not in s.prim and len(s.faces)]
     room, left_out = MOST_TRIANGLES, 0
-    for shape in sorted(shapes, key=lambda s: (s.link not in robots, -float(np.ptp(s.vertices, axis=0).max()))):
+    for shape in sorted(
+        shapes, key=lambda s: (s.link not in robots, -float(np.ptp(s.vertices, axis=0).max()))
+    ):
         points, faces = simplified(shape.vertices.astype(float), shape.faces, MOST_TRIANGLES // 10)
         if len(faces) > room:
             left_out += 1
@@ -67,13 +78,16 @@ def _body_of(
 ) -> tuple[str, dict[str, Any]]:
     """Name of the body that a shape is a part of, and what is known of the body."""
     if shape.link not in robots:
-        return "lab", {"name": "lab"}
+        robot = shape.link and any(
+            link.joint and link.base == links[shape.link].base for link in links.values()
+        )
+        return ("standing", {"name": "standing", "solid": 1}) if robot else ("lab", {"name": "lab"})
     link, k = links[shape.link], robots[shape.link]
     if link.joint in sides[k] and link.rolling_axis is not None:
         side = ("left", "right")[sides[k][link.joint]]
         pose = {"p": link.p_base_link, "q": link.q_base_link_xyzw, "axis": link.rolling_axis}
-        return shape.link, {"name": shape.link, "robot": k, "side": side, **pose}
-    return f"{k}/", {"name": f"{k}/", "robot": k}
+        return shape.link, {"name": shape.link, "robot": k, "solid": 1, "side": side, **pose}
+    return f"{k}/", {"name": f"{k}/", "robot": k, "solid": 1}
 
 
 def _pack(arrays: dict[str, Array], name: str, parts: Sequence[tuple[Shape, Array, Array]]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ main().catch((error) => {
 async function main() {
   const data = await unpack(document.getElementById("player-data").textContent);
   const clock = new Clock(data);
-  if (clock.robots.length) for (const part of [charts, bar, words, table, choice]) part(clock);
+  for (const part of clock.robots.length ? [charts, bar, words, table, choice] : []) part(clock);
   if (root.dataset.scene === "lab") {
     try {
       stage(data, clock);
@@ -27,7 +27,7 @@ async function main() {
   }
   const seek = () => { // #t=30&view=top&robot=bob&heading=90
     const told = new URLSearchParams(location.hash.slice(1));
-    for (const part of ["views", "choice"]) at(part).querySelector(`[value="${CSS.escape(told.get(part.replace(/s$/, "").replace("choice", "robot")) || "")}"]`)?.click();
+    for (const [part, name] of [["views", "view"], ["choice", "robot"]]) at(part).querySelector(`[value="${CSS.escape(told.get(name) || "")}"]`)?.click();
     if (told.get("heading")) Object.assign(at("heading"), { value: told.get("heading") }).dispatchEvent(new Event("input"));
     if (told.get("t")) clock.seek(Number(told.get("t")) || 0);
   };
@@ -122,11 +122,7 @@ class Robot {
     if (column[i] === UNKNOWN || column[j] === UNKNOWN || gap <= 0) return column[i];
     return column[i] + (column[j] - column[i]) * Math.min(1, Math.max(0, (this.clock.now * 100 - t[i]) / gap));
   }
-  // A column in its unit, or 0 where it is unknown.
-  in(name, scale) {
-    const value = this.value(name);
-    return value === UNKNOWN ? 0 : value * scale;
-  }
+  in(name, scale) { const value = this.value(name); return value === UNKNOWN ? 0 : value * scale; }
   get place() { return this.value("x") === UNKNOWN ? null : ["x", "y", "z"].map((axis) => this.in(axis, 0.001)); }
   get yaw() { return this.in("yaw", Math.PI / 1800); }
 }
@@ -144,8 +140,8 @@ function words(clock) {
     ["reading − map", (a, i) => a.trail && scaled(a.trail[i], 1, 0, " nT")],
     ["heading", (a, i) => a.yaw && (a.yaw[i] === UNKNOWN ? "unknown" : said(degrees(a.yaw[i]), 1, "°"))]];
   const cells = shown.map(([name, text]) => {
-    const cell = at("now").appendChild(document.createElement("div"));
-    cell.append(element("dt", name), element("dd", ""));
+    const cell = at("now").appendChild(element("div"));
+    cell.append(element("dt", name), element("dd"));
     return [cell, text];
   });
   clock.wanting.push(() => {
@@ -190,8 +186,7 @@ function choice(clock) {
   mark();
 }
 
-function element(tag, text, attributes = {}) {
-  const made = document.createElement(tag);
+function element(tag, text = "", attributes = {}, made = document.createElement(tag)) {
   made.textContent = text;
   for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
   return made;
@@ -229,15 +224,8 @@ function bar(clock) {
 
 // ---- Charts
 
-const SVG = "http://www.w3.org/2000/svg";
 const LEFT = 46, RIGHT = 10, TOP = 8;
-
-function svg(tag, attributes, text) {
-  const made = document.createElementNS(SVG, tag);
-  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
-  if (text !== undefined) made.textContent = text;
-  return made;
-}
+const svg = (tag, attributes, text) => element(tag, text, attributes, document.createElementNS("http://www.w3.org/2000/svg", tag));
 
 function charts(clock) {
   let drawn = [];
@@ -257,20 +245,20 @@ function charts(clock) {
 class Chart {
   constructor(chart, robot, clock, number) {
     Object.assign(this, { chart, robot, clock, number, last: number === robot.charts.length - 1 });
-    this.box = element("figure", "");
-    const title = document.createElement("figcaption");
+    this.box = element("figure");
+    const title = element("figcaption");
     title.append(element("b", `${chart.title} [${chart.unit}]${chart.band ? ", 90 % band" : ""}`));
-    chart.lines.forEach((line, k) => title.append(element("span", line.name, { class: `key ${ink(k)}` })));
-    this.value = element("output", "", { "aria-live": "off" });
-    title.append(this.value);
+    this.values = chart.lines.map((line, k) => {
+      title.append(element("span", `${line.name} `, { class: `key ${ink(k)}` }));
+      return title.lastChild.appendChild(element("output", "", { "aria-live": "off" }));
+    });
     this.svg = svg("svg", { role: "img", "aria-label": this.summary() });
     this.box.append(title, this.svg);
-    const seek = (event) => {
+    for (const kind of ["pointerdown", "pointermove"]) this.svg.addEventListener(kind, (event) => {
       const box = this.svg.getBoundingClientRect();
-      clock.seek(((event.clientX - box.left - LEFT) / (box.width - LEFT - RIGHT)) * clock.end);
-    };
-    this.svg.addEventListener("pointerdown", (event) => { this.svg.setPointerCapture(event.pointerId); seek(event); });
-    this.svg.addEventListener("pointermove", (event) => { if (event.buttons) seek(event); });
+      if (kind === "pointerdown") this.svg.setPointerCapture(event.pointerId);
+      if (event.buttons) clock.seek(((event.clientX - box.left - LEFT) / (box.width - LEFT - RIGHT)) * clock.end);
+    });
   }
   column(name) { return this.robot.columns[name]; }
   summary() {
@@ -364,17 +352,15 @@ class Chart {
   point() {
     if (!this.cursor) return;
     const i = this.robot.row, { chart } = this, x = this.x(this.robot.columns.t[i] / 100);
-    this.cursor.setAttribute("x1", x);
-    this.cursor.setAttribute("x2", x);
+    for (const name of ["x1", "x2"]) this.cursor.setAttribute(name, x);
     chart.lines.forEach((line, k) => {
       const value = this.column(line.column)[i];
       this.dots[k].setAttribute("visibility", value === UNKNOWN ? "hidden" : "visible");
       this.dots[k].setAttribute("cx", x);
       this.dots[k].setAttribute("cy", this.y(value * chart.scale));
+      const text = (name) => scaled(this.column(name)[i], chart.scale, chart.digits);
+      this.values[k].textContent = text(line.column) + (chart.band ? ` ± ${text(chart.band)}` : "");
     });
-    const text = (name) => scaled(this.column(name)[i], chart.scale, chart.digits);
-    const texts = chart.lines.map((line) => text(line.column));
-    this.value.textContent = `${chart.band ? `${texts[0]} ± ${text(chart.band)}` : texts.join(" / ")} ${chart.unit}`;
   }
 }
 
@@ -425,12 +411,9 @@ function looking(eye, target, up) {
 }
 
 function rigid([x, y, z, w], p) {
-  return [
-    1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w), 0,
+  return [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w), 0,
     2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w), 0,
-    2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y), 0,
-    p[0], p[1], p[2], 1,
-  ];
+    2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y), 0, ...p, 1];
 }
 
 const about = (axis, angle) => [...axis.map((a) => a * Math.sin(angle / 2)), Math.cos(angle / 2)];
@@ -454,15 +437,15 @@ void main() {
 // What stands between the eye and the map is glass: it is drawn in the second pass, thinly.
 const BODY_F = `${COMMON}
 in vec3 place, normal; in vec4 colour;
-uniform vec3 eye, sun; uniform vec4 rect; uniform mat4 light; uniform sampler2DShadow shade; uniform int pass, solid;
+uniform vec3 eye, sun; uniform vec4 rect; uniform mat4 light; uniform sampler2DShadow shade; uniform float pass, solid;
 out vec4 ink;
 void main() {
   bool glass = colour.a < .99;
-  if (solid == 0 && place.z > .03 && eye.z > place.z + .01) {
+  if (solid < .5 && place.z > .03 && eye.z > place.z + .01) {
     vec3 q = eye + (place - eye) * (eye.z / (eye.z - place.z));
     glass = glass || all(greaterThan(q.xy, rect.xy)) && all(lessThan(q.xy, rect.zw));
   }
-  if (glass != (pass == 1)) discard;
+  if (glass != (pass > .5)) discard;
   vec3 N = normalize(normal);
   if (dot(N, eye - place) < 0.) N = -N;
   vec3 s = (light * vec4(place + N * .02, 1.)).xyz * .5 + .5;
@@ -472,7 +455,7 @@ void main() {
   } else lit = 1.;
   vec3 base = pow(colour.rgb, vec3(2.2));
   vec3 out_ = base * (.34 + .16 * N.z + .62 * lit * max(0., dot(N, sun)));
-  ink = vec4(seen(out_), pass == 1 ? .11 : 1.);
+  ink = vec4(seen(out_), pass > .5 ? .11 : 1.);
 }`;
 const SHADE_F = `${COMMON}
 in vec3 place, normal; in vec4 colour; out vec4 ink;
@@ -493,9 +476,9 @@ const TRAIL_V = `${COMMON}
 in vec2 p, across; in vec2 tv; uniform mat4 camera; uniform float half_, z; out vec2 t;
 void main() { t = tv; gl_Position = camera * vec4(p + across * half_, z, 1.); }`;
 const TRAIL_F = `${COMMON}
-in vec2 t; uniform float now, most; uniform vec4 plain; uniform int later; uniform sampler2D colours; out vec4 ink;
+in vec2 t; uniform float now, most, later; uniform vec4 plain; uniform sampler2D colours; out vec4 ink;
 void main() {
-  if ((t.x > now) != (later == 1)) discard;
+  if ((t.x > now) != (later > .5)) discard;
   ink = plain.a > 0. ? plain : t.y < -1e8 ? vec4(.6, .6, .6, 1.)
     : vec4(texture(colours, vec2(clamp(.5 + .5 * t.y / most, 0., 1.) * 255. / 256. + .5 / 256., .5)).rgb, 1.);
 }`;
@@ -523,12 +506,9 @@ function stage(data, clock) {
     return body.axis ? times(times(base, rigid(body.q, body.p)), rigid(about(body.axis, robot.in(body.side, 0.01)), [0, 0, 0])) : base;
   });
   const bodies = (program, placed, view) => {
-    gl.useProgram(program.id);
-    gl.uniformMatrix4fv(program.at("camera"), false, view);
     lab.forEach((body, k) => {
       if (!placed[k]) return;
-      gl.uniformMatrix4fv(program.at("model"), false, placed[k]);
-      if (program.at("solid")) gl.uniform1i(program.at("solid"), body.robot === undefined ? 0 : 1);
+      use(gl, program, { camera: view, model: placed[k], solid: body.solid || 0 });
       gl.bindVertexArray(body.array);
       gl.drawArrays(gl.TRIANGLES, 0, body.count);
     });
@@ -539,28 +519,25 @@ function stage(data, clock) {
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     const placed = models(), { eye, view } = camera.now(width / height);
     gl.enable(gl.DEPTH_TEST);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, shade.buffer);
-    gl.viewport(0, 0, shade.size, shade.size);
-    gl.clear(gl.DEPTH_BUFFER_BIT);
-    bodies(make.shade, placed, light);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    if (shade.time !== clock.now) { // only what moves changes the shadows
+      shade.time = clock.now;
+      gl.bindFramebuffer(gl.FRAMEBUFFER, shade.buffer);
+      gl.viewport(0, 0, shade.size, shade.size);
+      gl.clear(gl.DEPTH_BUFFER_BIT);
+      bodies(make.shade, placed, light);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    }
     gl.viewport(0, 0, width, height);
     gl.clearColor(...skyOf(canvas), 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
     const pass = (number) => {
-      gl.useProgram(make.body.id);
-      gl.uniform3fv(make.body.at("eye"), eye);
-      gl.uniform3fv(make.body.at("sun"), sun);
-      gl.uniform4fv(make.body.at("rect"), rect);
-      gl.uniformMatrix4fv(make.body.at("light"), false, light);
-      gl.uniform1i(make.body.at("pass"), number);
-      sampled(gl, make.body, [[shade.texture, "shade"]]);
+      use(gl, make.body, { eye, sun, rect, light, pass: number }, { shade: shade.texture });
       bodies(make.body, placed, view);
     };
     pass(0);
     if (floor) floor.draw(view, rect);
-    trails.draw(view, clock, box.size);
+    trails.draw(view, clock.now, box.size);
     gl.enable(gl.BLEND);
     gl.depthMask(false);
     pass(1);
@@ -585,17 +562,15 @@ function stage(data, clock) {
 const skyOf = (canvas) => getComputedStyle(canvas).backgroundColor.match(/[\d.]+/g).slice(0, 3).map((v) => v / 255);
 
 function programs(gl) {
-  const compiled = (kind, text) => {
-    const made = gl.createShader(kind);
-    gl.shaderSource(made, text);
-    gl.compileShader(made);
-    if (!gl.getShaderParameter(made, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(made));
-    return made;
-  };
-  const program = (vertex, fragment) => {
+  const program = (...texts) => {
     const id = gl.createProgram(), places = {};
-    gl.attachShader(id, compiled(gl.VERTEX_SHADER, vertex));
-    gl.attachShader(id, compiled(gl.FRAGMENT_SHADER, fragment));
+    texts.forEach((text, k) => {
+      const made = gl.createShader(k ? gl.FRAGMENT_SHADER : gl.VERTEX_SHADER);
+      gl.shaderSource(made, text);
+      gl.compileShader(made);
+      if (!gl.getShaderParameter(made, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(made));
+      gl.attachShader(id, made);
+    });
     [["p", 0], ["n", 1], ["across", 1], ["c", 2], ["tv", 2]].forEach(([name, k]) => gl.bindAttribLocation(id, k, name));
     gl.linkProgram(id);
     if (!gl.getProgramParameter(id, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(id));
@@ -617,8 +592,14 @@ function verticesOf(gl, attributes) {
   return made;
 }
 
-function sampled(gl, program, textures) {
-  textures.forEach(([made, name], k) => {
+// Take a program, with the numbers, vectors and matrices of its uniforms, and its textures.
+function use(gl, program, values, textures = {}) {
+  gl.useProgram(program.id);
+  for (const [name, value] of Object.entries(values)) {
+    if (value.length === 16) gl.uniformMatrix4fv(program.at(name), false, value);
+    else gl[`uniform${value.length || 1}fv`](program.at(name), value.length ? value : [value]);
+  }
+  Object.entries(textures).forEach(([name, made], k) => {
     gl.activeTexture(gl.TEXTURE0 + k);
     gl.bindTexture(gl.TEXTURE_2D, made);
     gl.uniform1i(program.at(name), k);
@@ -638,8 +619,7 @@ function bodyOf(gl, body, arrays) {
   const across = [], meeting = Array.from({ length: welded.size }, () => []); // normals of faces, by the points where they meet
   for (let f = 0; f < count; f += 3) {
     const [p, q, r] = [0, 1, 2].map((k) => points[faces[f + k]]), normal = cross(less(q, p), less(r, p));
-    across.push(normal);
-    for (let k = 0; k < 3; k++) meeting[same[faces[f + k]]].push(normal);
+    for (const normals of [across, ...[0, 1, 2].map((k) => meeting[same[faces[f + k]]])]) normals.push(normal);
   }
   const p = new Float32Array(3 * count), normals = new Float32Array(3 * count), c = new Uint8Array(4 * count);
   for (let f = 0, part = 0; f < count; f += 3) {
@@ -658,19 +638,18 @@ function bodyOf(gl, body, arrays) {
   return { ...body, array: verticesOf(gl, [[p, 3], [normals, 3], [c, 4, true]]), count };
 }
 
-function texture(gl, filter) {
+function texture(gl) {
   const made = gl.createTexture();
   gl.bindTexture(gl.TEXTURE_2D, made);
-  for (const [name, value] of [["MIN_FILTER", filter], ["MAG_FILTER", filter], ["WRAP_S", gl.CLAMP_TO_EDGE], ["WRAP_T", gl.CLAMP_TO_EDGE]]) {
-    gl.texParameteri(gl.TEXTURE_2D, gl[`TEXTURE_${name}`], value);
-  }
+  for (const name of ["MIN_FILTER", "MAG_FILTER"]) gl.texParameteri(gl.TEXTURE_2D, gl[`TEXTURE_${name}`], gl.LINEAR);
+  for (const name of ["WRAP_S", "WRAP_T"]) gl.texParameteri(gl.TEXTURE_2D, gl[`TEXTURE_${name}`], gl.CLAMP_TO_EDGE);
   return made;
 }
 
 const rgbOf = (colour) => [0, 2, 4].map((k) => parseInt(colour.slice(k, k + 2), 16));
 
 function ramp(gl, colours) {
-  const made = texture(gl, gl.LINEAR), pixels = new Uint8Array(1024), rgb = colours.map(rgbOf);
+  const made = texture(gl), pixels = new Uint8Array(1024), rgb = colours.map(rgbOf);
   for (let i = 0; i < 256; i++) {
     const x = (i / 255) * (rgb.length - 1), k = Math.min(rgb.length - 2, Math.floor(x));
     for (let m = 0; m < 3; m++) pixels[4 * i + m] = rgb[k][m] + (rgb[k + 1][m] - rgb[k][m]) * (x - k);
@@ -682,7 +661,7 @@ function ramp(gl, colours) {
 
 // The floor: the map at a heading as a texture, mixed from its harmonics.
 function floorOf(gl, program, map, arrays) {
-  const colours = ramp(gl, VIRIDIS), values = texture(gl, gl.LINEAR), n = map.nx * map.ny;
+  const colours = ramp(gl, VIRIDIS), values = texture(gl), n = map.nx * map.ny;
   const mixed = new Float32Array(2 * n), step = niceStep((map.high - map.low) / 15);
   const square = verticesOf(gl, [[new Float32Array([0, 0, 1, 0, 0, 1, 1, 1]), 2]]);
   const turn = (yaw) => {
@@ -699,12 +678,7 @@ function floorOf(gl, program, map, arrays) {
   };
   turn(0);
   const draw = (view, rect) => {
-    gl.useProgram(program.id);
-    gl.uniformMatrix4fv(program.at("camera"), false, view);
-    gl.uniform4fv(program.at("rect"), rect);
-    gl.uniform2f(program.at("size"), map.nx, map.ny);
-    gl.uniform1f(program.at("step_"), step / (map.high - map.low));
-    sampled(gl, program, [[values, "values"], [colours, "colours"]]);
+    use(gl, program, { camera: view, rect, size: [map.nx, map.ny], step_: step / (map.high - map.low) }, { values, colours });
     gl.enable(gl.POLYGON_OFFSET_FILL);
     gl.polygonOffset(-2, -2);
     gl.bindVertexArray(square);
@@ -725,23 +699,14 @@ function trailsOf(gl, program, robots) {
     const edge = robots.length > 1 ? rgbOf(robot.colour).map((v) => v / 255) : [0.07, 0.08, 0.1];
     return { edge, ...ribbonOf(gl, robot.columns) };
   });
-  const begin = (view, clock) => {
-    gl.useProgram(program.id);
-    gl.uniformMatrix4fv(program.at("camera"), false, view);
-    gl.uniform1f(program.at("now"), clock ? clock.now : 1);
-    gl.uniform1f(program.at("most"), most);
-    sampled(gl, program, [[colours, "colours"]]);
-  };
-  const strip = (count, half, z, plain, later = 0) => {
-    gl.uniform1f(program.at("half_"), half);
-    gl.uniform1f(program.at("z"), z);
-    gl.uniform4fv(program.at("plain"), plain);
-    gl.uniform1i(program.at("later"), later);
+  const begin = (camera, now) => use(gl, program, { camera, now, most }, { colours });
+  const strip = (count, half_, z, plain, later = 0) => {
+    use(gl, program, { half_, z, plain, later });
     gl.drawArrays(gl.TRIANGLE_STRIP, 0, count);
   };
-  const draw = (view, clock, size) => {
-    const wide = Math.max(0.022, size / 330), around = paths.length > 1 ? 1.7 : 1.35;
-    begin(view, clock);
+  const draw = (view, now, size) => {
+    const wide = Math.max(0.022, size / 330), around = paths.length > 1 ? 1.9 : 1.35;
+    begin(view, now);
     gl.enable(gl.POLYGON_OFFSET_FILL);
     for (const { array, count, edge } of paths) {
       gl.bindVertexArray(array);
@@ -755,7 +720,7 @@ function trailsOf(gl, program, robots) {
   // The estimates of a localizer: each as its 90 % ellipse and its place, over everything.
   const ring = verticesOf(gl, [[new Float32Array(196), 2]]), buffer = gl.getParameter(gl.ARRAY_BUFFER_BINDING);
   const estimates = (view, size) => {
-    begin(view);
+    begin(view, 1);
     gl.bindVertexArray(ring);
     gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
     gl.disable(gl.DEPTH_TEST);
@@ -778,13 +743,12 @@ function trailsOf(gl, program, robots) {
 }
 
 function ribbonOf(gl, { x, y, t, trail }) {
-  const points = [];
+  const points = [], p = [], across = [], tv = [];
   for (let i = 0; i < t.length; i++) {
     const last = points[points.length - 1], place = [x[i] / 1000, y[i] / 1000];
     if (x[i] === UNKNOWN || (last && Math.hypot(place[0] - last.place[0], place[1] - last.place[1]) <= 0.008)) continue;
     points.push({ place, tv: [t[i] / 100, trail && trail[i] !== UNKNOWN ? trail[i] : -1e9] });
   }
-  const p = [], across = [], tv = [];
   points.forEach((point, i) => {
     const [before, after] = [points[Math.max(0, i - 1)].place, points[Math.min(points.length - 1, i + 1)].place];
     const d = [after[0] - before[0], after[1] - before[1]], length = Math.hypot(...d) || 1;
@@ -798,7 +762,7 @@ function ribbonOf(gl, { x, y, t, trail }) {
 }
 
 function shadowOf(gl) {
-  const size = 2048, made = texture(gl, gl.LINEAR), buffer = gl.createFramebuffer();
+  const size = 2048, made = texture(gl), buffer = gl.createFramebuffer();
   gl.texStorage2D(gl.TEXTURE_2D, 1, gl.DEPTH_COMPONENT24, size, size);
   gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_COMPARE_MODE, gl.COMPARE_REF_TO_TEXTURE);
   gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
@@ -811,11 +775,8 @@ function shadowOf(gl) {
 function around(lab, robots, rect) {
   const low = [Infinity, Infinity, 0], high = [-Infinity, -Infinity, 0.5];
   const add = (...place) => place.forEach((v, k) => { low[k] = Math.min(low[k], v); high[k] = Math.max(high[k], v); });
-  for (const body of lab) if (body.robot === undefined) {
-    add(...body.low);
-    add(...body.low.map((v, k) => v + body.size[k]));
-  }
-  if (rect) { add(rect[0], rect[1]); add(rect[2], rect[3]); }
+  for (const body of lab) if (body.robot === undefined) [body.low, body.low.map((v, k) => v + body.size[k])].forEach((v) => add(...v));
+  if (rect) [rect.slice(0, 2), rect.slice(2)].forEach((v) => add(...v));
   for (const { columns: { x, y } } of robots) if (!rect && !lab.length && x) x.forEach((v, i) => v === UNKNOWN || add(v / 1000, y[i] / 1000));
   low[2] = 0;
   const focus = rect || [...low.slice(0, 2), ...high.slice(0, 2)];
@@ -836,8 +797,7 @@ class Camera {
     for (const button of at("views").children) button.addEventListener("click", () => this.take(button.value));
     const fingers = new Map();
     canvas.addEventListener("pointerdown", (event) => {
-      canvas.setPointerCapture(event.pointerId);
-      fingers.set(event.pointerId, event);
+      canvas.setPointerCapture(fingers.set(event.pointerId, event) && event.pointerId);
       canvas.focus({ preventScroll: true });
     });
     for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));
@@ -901,8 +861,8 @@ class Camera {
       azimuth = robot.yaw + Math.PI + (azimuth + 1.15);
       elevation = Math.max(0.2, elevation - 0.15);
     }
-    const c = Math.cos(elevation);
-    const eye = [target[0] + far * c * Math.cos(azimuth), target[1] + far * c * Math.sin(azimuth), target[2] + far * Math.sin(elevation)];
+    const c = Math.cos(elevation), way = [c * Math.cos(azimuth), c * Math.sin(azimuth), Math.sin(elevation)];
+    const eye = target.map((v, k) => v + far * way[k]);
     return { eye, view: times(perspective(angle, aspect, far / 50, far * 4 + 60), looking(eye, target, up)) };
   }
 }

@@ -168,8 +168,8 @@ def rows_shown(run: Run, most: int = MOST_ROWS) -> NDArray[np.intp]:
 def columns_of(run: Run, rows: Any, start_s: float) -> tuple[dict[str, Array], dict[str, str]]:
     """Columns of a page, and the names of those that are drawn.
 
-    Times are in 10 ms from `start_s`, places in mm, headings in tenths of a degree, angles of wheels in 10 mrad,
-    fields in nT; the fields that are shown in uT with two digits are in 10 nT.
+    Times are in 10 ms from `start_s`, places in mm, headings in tenths of a degree, angles of wheels in
+    10 mrad, fields in nT; the fields that are shown in uT with two digits are in 10 nT.
     """
     arrays: dict[str, Array] = {}
 

@@ -1,7 +1,7 @@
 """Reports: one run or several as a page; two runs compared; and one path driven twice."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from magtwin.figures.canvas import (
 from magtwin.figures.page import Page, Section, Table
 from magtwin.figures.player import player_of
 from magtwin.figures.runs import field_name, path_picture, position_name
+from magtwin.report.verdict import HOLDS_ONE, Tally
 from magtwin.run.compare import ERRORS, Agreement, Comparison, Traversals, errors_of, terms_of
 from magtwin.run.figures import prediction_nt
 from magtwin.run.run import COLUMNS, Metadata, Run
@@ -43,6 +44,14 @@ ALIGNED = {
     "placed": "by distance driven",
 }
 """How two traversals of a path are aligned."""
+
+OVERVIEW = Table(
+    "Overview",
+    ("run", "path", "seed", "readings", "duration [s]", "distance [m]", "MAE [nT]", "RMS [nT]", "events"),
+    (),
+    "MAE and RMS: error of b_measured_nt against the exact field, where that is known.",
+)
+"""One row per run, without its rows."""
 
 MEASURES = ("mean", "RMS", "mean absolute", "maximum")
 
@@ -88,19 +97,38 @@ def page_of_runs(
             raise InputError(f"{named.name}: has no readings to report on")
     sections = []
     for k, named in enumerate(runs):
-        sections.append(_section(named, pictures and len(runs) > 1))
+        sections.append(_section(named))
         advance(k + 1)
-    if len(runs) == 1:
-        lead = runs[0].run.report().verdict or _sentence(runs[0].run)
-        still = path_picture(runs[0].run, runs[0].field, runs[0].planned)
+    if _together([named.run for named in runs]):
+        first, every = runs[0], [named.run for named in runs]
+        still = path_picture(first.run, first.field, first.planned) if pictures else None
         data = b"" if still is None else still.data
-        player = player_of([runs[0].run], runs[0].field, runs[0].stage, still=data) if pictures else None
-        return Page(_title(runs[0]), lead, (sections[0],), player=player)
-    head = ("run", "path", "seed", "readings", "duration [s]", "distance [m]", "MAE [nT]", "RMS [nT]")
-    note = "MAE and RMS: error of b_measured_nt against the exact field, where that is known."
-    overview = Table("Overview", (*head, "events"), tuple(map(_overview, runs)), note)
+        player = player_of(every, first.field, first.stage, still=data) if pictures else None
+        title, lead = _title(first), first.run.report().verdict or _sentence(first.run)
+        if len(runs) > 1:
+            title = f"{len(runs)} robots in {first.run.metadata.get('scene', 'a scene')}"
+            lead = (
+                _verdict(every) or f"{', '.join(str(run.metadata['robot']) for run in every)} drove together."
+            )
+        return Page(title, lead, tuple(sections), player=player)
+    overview = replace(OVERVIEW, rows=tuple(map(overview_of, runs)))
     lead = f"{sum(named.run.rows for named in runs):,} readings in all."
     return Page(f"{len(runs)} runs", lead, tuple(sections), overview)
+
+
+def _together(runs: Sequence[Run]) -> bool:
+    """Whether runs are those of different robots that drove in one scene at the same time, or only one."""
+    facts = {tuple(run.metadata.get(name) for name in ("scene_sha256", "seed", "lab")) for run in runs}
+    robots = {run.metadata.get("robot") for run in runs} - {None}
+    return len(runs) == 1 or (len(facts) == 1 and len(robots) == len(runs))
+
+
+def _verdict(runs: Sequence[Run]) -> str:
+    """The verdict on the models of several robots; "" without one."""
+    tally = Tally()
+    for run in runs:
+        run.add_to(tally)
+    return tally.verdict(f"the exact field of {len(runs)} robots, one session", holds=HOLDS_ONE)
 
 
 def _title(named: NamedRun) -> str:
@@ -123,7 +151,7 @@ def _sentence(run: Run) -> str:
     return ", ".join(words) + "."
 
 
-def _section(named: NamedRun, pictures: bool) -> Section:
+def _section(named: NamedRun) -> Section:
     run = named.run
     rows: tuple[tuple[Any, ...], ...] = tuple(
         (f.name, f.value, "" if f.spread is None else f.spread, f.unit, f.note) for f in run.report().figures
@@ -147,12 +175,12 @@ def _section(named: NamedRun, pictures: bool) -> Section:
     tables.append(Table("Events", head, events, "" if events else "None."))
     rows = tuple(run.metadata.items())
     tables.append(Table("Provenance", ("metadata", ""), rows, "" if rows else "No metadata.", exact=True))
-    drawn = path_picture(run, named.field, named.planned) if pictures else None
     lead = f"{named.name}: {_sentence(run)} {named.note}".strip()
-    return Section(_title(named), lead, () if drawn is None else (drawn,), tuple(tables))
+    return Section(_title(named), lead, (), tuple(tables))
 
 
-def _overview(named: NamedRun) -> tuple[Any, ...]:
+def overview_of(named: NamedRun) -> tuple[Any, ...]:
+    """The row of a run in `OVERVIEW`."""
     run = named.run
     distance, total = _distance_m(run), errors_of(run).get("total")
     events = sum(int(run[name].any()) for name in run if name.startswith("flag_"))

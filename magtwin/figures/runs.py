@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.maps.statistics import colour_limits
+from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
 from magtwin.figures.canvas import (
     INK,
     MAP_INK,
@@ -249,6 +249,38 @@ def path_picture(run: Run, field: AnomalyMap | None, planned: ArrayLike | None) 
     over = "the path" if field is None else f"the path over the map {field.name}"
     alt = f"{over}, coloured by the field along it"
     return picture(figure, f"Path driven, coloured by {column}", alt=alt, kind="png")
+
+
+def still_of(run: Run | None, field: AnomalyMap | None) -> Picture | None:
+    """A small picture without axes: the path of a run over its map, coloured by the reading minus the map.
+
+    None if neither the map nor two places are known. Without a run, the map alone.
+    """
+    place = None if run is None else position_name(run)
+    known = np.isfinite(run[place][:, :2]).all(axis=1) if run is not None and place else np.empty(0, bool)
+    p_xy = run[place][known, :2] if run is not None and place else np.empty((0, 2))
+    if field is None and len(p_xy) < 2:
+        return None
+    low, high = np.reshape(field.extent, (2, 2)).T if field else (p_xy.min(axis=0), p_xy.max(axis=0))
+    wide, tall = np.maximum(high - low, 0.1)
+    figure = new_figure(2.0, float(np.clip(2.0 * tall / wide, 0.8, 2.4)))
+    figure.set_layout_engine("none")
+    ax = figure.add_axes((0, 0, 1, 1))
+    if field is not None:
+        mean = mean_field_ut(field)
+        least, most = colour_limits(mean)
+        draw_cells(ax, field.x_m, field.y_m, mean, COLOUR_MAP, vmin=least, vmax=most, rasterized=True)
+    if run is not None and len(p_xy) > 1:
+        reading = field_name(run)
+        off = (run[reading] - run["b_map_nt"])[known] if reading and "b_map_nt" in run else None
+        ax.plot(*p_xy[evenly(len(p_xy), 1000)].T, color=INK if off is not None else "white", lw=3.2)
+        if off is not None and np.isfinite(off).any():
+            most = float(np.nanpercentile(np.abs(off), 99)) or 1.0
+            coloured_line(ax, p_xy, off, (-most, most), "RdBu_r", 2)
+    ax.set_aspect("equal")
+    ax.axis("off")
+    title = "The path over the map" if run is not None else "The map"
+    return picture(figure, title, kind="png")
 
 
 def _title(run: Run, p_xy: Array | None = None) -> str:

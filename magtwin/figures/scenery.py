@@ -411,7 +411,9 @@ def _steps(p_xy: Array) -> NDArray[np.intp]:
 
 def placed(points: ArrayLike, link: Link, *, in_base: bool = False) -> Array:
     """Points of a link in world, or in the base of its robot at rest [m], shape (N, 3)."""
-    pose = (link.p_base_link, link.q_base_link_xyzw) if in_base else (link.p_world_link, link.q_world_link_xyzw)
+    pose = (
+        (link.p_base_link, link.q_base_link_xyzw) if in_base else (link.p_world_link, link.q_world_link_xyzw)
+    )
     T = _matrix(*pose)
     return np.asarray(points) @ T[:3, :3].T + T[:3, 3]
 

@@ -5,7 +5,8 @@ import pytest
 from magtwin import load_run
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.figures.views import film, report_runs
+from magtwin.figures.reporting import report_runs
+from magtwin.figures.views import film
 from magtwin.io.convert import convert_run
 from magtwin.io.map_files import map_file, open_map
 from magtwin.io.provenance import repeat_of
