@@ -1,6 +1,6 @@
 """Film the page of a run: screenshots of Chromium at `#t=`, as a GIF and its middle as a PNG.
 
-    python docs/page_film.py PAGE.html docs/page.gif docs/page.png
+python docs/page_film.py PAGE.html docs/page.gif docs/page.png
 """
 
 import io
@@ -18,7 +18,7 @@ BROWSER = (
 )
 FRAMES, FRAME_S, WIDTH, COLOURS = 36, 0.22, 800, 96
 STILL_S = 45.4
-"""Frames of the film, seconds that each is shown, its width [pixel] and colours; time of the PNG in the run."""
+"""Frames of the film, seconds that each is shown, its width [pixel] and colours; time of the PNG."""
 
 
 def shot(page: Path, t: float) -> bytes:

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
+from magtwin.figures.canvas import evenly
+from magtwin.figures.style import PALETTE
 from magtwin.files.file import read_bytes
 from magtwin.files.outputs import output
 from magtwin.frames import rotate
@@ -40,7 +42,23 @@ MARGIN = 1.08
 """Distance of the camera, relative to the least distance from which everything is visible."""
 
 AROUND_M = 0.7
-"""Margin around and above a heat-map or a path that a camera over the lab keeps in view [m]."""
+"""Margin around and above a path that a camera over the lab keeps in view [m]."""
+
+TALL_M, WIDE_M, CEILING_M = 1.0, 1.2, 1.8
+"""Least height and width of a wall, and least height of a ceiling [m]. Furniture as large in one piece is one."""
+
+PILLAR_M, BESIDE_M = 2.2, 0.15
+"""Height from which what stands on the heat-map is a veil in front of it, and how far beside still counts as
+on it [m]. Lower furniture is solid."""
+
+STUMP_M = 0.12
+"""Height down to which a wall is cut that hides the room [m]."""
+
+MOST_RAYS, MOST_FACES = 1000, 1000
+"""Points by which a wall is found to hide the room, and its faces, the largest first."""
+
+LOW_M = 0.05
+"""What is no higher than this is the ground, which need not be in view [m]."""
 
 LAB_ELEVATION_DEG = 36.0
 """Elevation of a camera over a lab above its target's horizon [deg]."""
@@ -53,7 +71,7 @@ GL_PACKAGES = "libegl1 libgl1-mesa-dri libx11-6"
 
 BACKGROUND = "#e9edf1"
 
-INK = "#20262d"
+INK = PALETTE["ink"][0]
 
 LIGHTS = (((0.6, 0.9, 1.4), 0.75), ((0.9, -1.0, 0.5), 0.45), ((-0.9, 0.2, 0.6), 0.4), ((0.1, 0.0, -1.0), 0.3))
 """Direction towards each light in world, and its strength."""
@@ -92,6 +110,14 @@ class Camera:
 
     view_angle_deg: float = 30.0
     """Angle between the upper and the lower edge [deg]."""
+
+    @classmethod
+    def between(cls, place: Vec3, target: Vec3, view_angle_deg: float = 40.0) -> "Camera":
+        """A camera at a place that looks at a target [m]."""
+        back = np.subtract(place, target)
+        distance = float(np.linalg.norm(back))
+        turn, rise = np.degrees([np.arctan2(back[1], back[0]), np.arcsin(back[2] / distance)]).tolist()
+        return cls(turn, rise, distance, target, view_angle_deg)
 
     def axes(self) -> Array:
         """Right, up and back axes in world, as rows, shape (3, 3)."""
@@ -167,6 +193,16 @@ def is_subject(shape: Shape, scale: ColourScale | None) -> bool:
     return bool(shape.link) or (scale is not None and shape.prim == scale.prim)
 
 
+def inside(shapes: Sequence[Shape], worlds: Sequence[Array]) -> list[Array]:
+    """Vertices in world [m] of the shapes that are no walls, without a ground that reaches far beyond."""
+    rest = [v for s, v in zip(shapes, worlds, strict=True) if not is_wall(s, v)]
+    things = [v for v in rest if v[:, 2].max() > LOW_M]
+    if not things:
+        return rest
+    reach = 1.5 * np.ptp(np.vstack(things), axis=0)[:2]
+    return [v for v in rest if v[:, 2].max() > LOW_M or (np.ptp(v, axis=0)[:2] <= reach).all()]
+
+
 def room_above(points: ArrayLike) -> Array:
     """Corners of the box around points [m], with `AROUND_M` more on all sides and above, shape (8, 3)."""
     points = np.asarray(points, float)
@@ -175,6 +211,129 @@ def room_above(points: ArrayLike) -> Array:
     high[:2] += AROUND_M
     ends = zip((*low[:2], min(low[2], 0.0)), (*high[:2], max(low[2] + AROUND_M, high[2])), strict=True)
     return np.array(list(itertools.product(*ends)))
+
+
+class Walls:
+    """Walls, ceilings and blocks of a building; those that hide the room are cut down to a stump."""
+
+    def __init__(self, plotter: Any) -> None:
+        """No wall yet; `add` adds one."""
+        self._plotter = plotter
+        self._walls: list[tuple[Array, list[Any]]] = []
+        self._cut: list[bool] = []
+
+    def add(self, shape: Shape, vertices: Array, *, baked: bool) -> list[Any]:
+        """Add a wall with its vertices in world [m]; returns its actors, whole and cut."""
+        low = vertices * (1, 1, 0) + np.minimum(vertices, STUMP_M) * (0, 0, 1)
+        forms = [vertices] if vertices[:, 2].min() > CEILING_M else [vertices, low]
+        actors = [add_shape(self._plotter, shape, form, baked=baked) for form in forms]
+        corners = vertices[shape.faces]
+        size = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        self._walls.append((corners[np.argsort(-size, kind="stable")[:MOST_FACES]], actors))
+        self._cut.append(False)
+        return actors
+
+    def cut(self, place: ArrayLike, points: Array, *, more: bool = False) -> None:
+        """Cut the walls that hide one of the points [m], shape (N, 3), from a place; with `more`, others stay cut."""
+        for k, (corners, (whole, *stump)) in enumerate(self._walls):
+            inside = ((points > corners.min(axis=(0, 1))) & (points < corners.max(axis=(0, 1)))).all(axis=1)
+            self._cut[k] = (more and self._cut[k]) or hides(corners, place, points[~inside])
+            for actor, shown in ((whole, not self._cut[k]), *((low, self._cut[k]) for low in stump)):
+                actor.visibility = shown
+
+    def shown(self) -> list[Array]:
+        """Corners of each wall as it is drawn [m], of shape (N, 3)."""
+        ends = [STUMP_M if cut else np.inf for cut in self._cut]
+        every = zip(self._walls, ends, strict=True)
+        return [np.minimum(corners.reshape(-1, 3), (np.inf, np.inf, end)) for (corners, _), end in every]
+
+
+def is_wall(shape: Shape, vertices: Array) -> bool:
+    """Whether a shape with these vertices in world [m] is a wall, a ceiling or a block that is as large."""
+    x, y, z = np.ptp(vertices, axis=0)
+    ceiling = vertices[:, 2].min() > CEILING_M and min(x, y) >= WIDE_M
+    return not shape.link and bool(ceiling or (z >= TALL_M and max(x, y) >= WIDE_M))
+
+
+def hides(triangles: Array, place: ArrayLike, points: Array) -> bool:
+    """Whether triangles, shape (T, 3, 3), lie between a place and any of the points, shape (N, 3).
+
+    By Moeller and Trumbore (1997, Journal of Graphics Tools 2): place + t (point - place) lies in a triangle
+    a + u e1 + v e2 if u, v >= 0 and u + v <= 1.
+    """
+    a, e1, e2 = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    ray = (points - place)[:, None]
+    across, off = np.cross(ray, e2), np.asarray(place, float) - a
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = 1.0 / (across * e1).sum(axis=-1)
+        turned = np.cross(off, e1)
+        u, v, t = (
+            (across * off).sum(-1) * share,
+            (ray * turned).sum(-1) * share,
+            (turned * e2).sum(-1) * share,
+        )
+        return bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < 0.999)).any())
+
+
+def add_shape(plotter: Any, shape: Shape, vertices: NDArray, *, baked: bool = False) -> Any:
+    """Draw a shape on its own; returns its actor."""
+    if shape.texture is not None:
+        return add_textured(plotter, shape, vertices)
+    mesh, flat = mesh_of(shape, vertices), shape.vertex_colours is not None
+    if baked and not flat:
+        bake(mesh)
+    return plotter.add_mesh(mesh, opacity=shape.colour[3], **style_of(flat or baked))
+
+
+def add_still(
+    plotter: Any,
+    shapes: Sequence[Shape],
+    worlds: Sequence[Array],
+    scale: ColourScale | None,
+    *,
+    baked: bool = False,
+) -> tuple[list[Any], Walls, Array]:
+    """Draw what stands still, as one body per look.
+
+    Args:
+        plotter: The plotter.
+        shapes: The shapes.
+        worlds: Their vertices in world [m].
+        scale: Colour scale of the heat-map, or None.
+        baked: Whether light is put into the colours, so that no frame computes it.
+
+    Returns:
+        The actors that may hide heat-map and robot; the walls; and points of all that a wall must not hide
+        [m], shape (N, 3).
+    """
+    bodies: dict[tuple[bool, bool, float], list[Any]] = {}
+    screens, walls, seen = [], Walls(plotter), [np.empty((0, 3))]
+    floors = [v for s, v in zip(shapes, worlds, strict=True) if scale is not None and s.prim == scale.prim]
+    low, high = (
+        (np.vstack(floors).min(axis=0), np.vstack(floors).max(axis=0)) if floors else (np.inf, -np.inf)
+    )
+    high = high * (1, 1, 0) + (0, 0, PILLAR_M) if floors else high
+    for shape, vertices in zip(shapes, worlds, strict=True):
+        chosen, flat = is_subject(shape, scale), shape.vertex_colours is not None
+        if not chosen and is_wall(shape, vertices):
+            screens += walls.add(shape, vertices, baked=baked)
+            continue
+        if chosen or (vertices[:, 2].max() > LOW_M and np.sort(np.ptp(vertices, axis=0))[1] > LOW_M):
+            seen.append(vertices[evenly(len(vertices), 400 if flat else 24)])
+        hiding = not (chosen or ((vertices.mean(axis=0) > low) & (vertices.max(axis=0) < high)).all())
+        if shape.texture is not None:
+            actor = add_shape(plotter, shape, vertices)
+            screens += [actor] if hiding else []
+            continue
+        mesh = mesh_of(shape, vertices)
+        if baked and not flat:
+            bake(mesh)
+        bodies.setdefault((hiding, flat or baked, shape.colour[3]), []).append(mesh)
+    for (hiding, flat, opacity), meshes in bodies.items():
+        actor = plotter.add_mesh(joined(meshes), opacity=opacity, **style_of(flat))
+        screens += [actor] if hiding else []
+    points = np.vstack(seen)
+    return screens, walls, points[evenly(len(points), MOST_RAYS)] if len(points) else points
 
 
 @translates
@@ -201,22 +360,9 @@ def _draw(
     worlds = [upright(stage, vertices) for vertices in worlds]
     everything, scale = np.vstack(worlds), read_colour_scale(stage)
     subject = [is_subject(shape, scale) for shape in shapes]
-    around = everything
-    if scale is not None and any(s.prim == scale.prim for s in shapes):
-        camera = camera or Camera(elevation_deg=LAB_ELEVATION_DEG)
-        around = room_above(np.vstack([v for v, chosen in zip(worlds, subject, strict=True) if chosen]))
-    camera = camera or Camera()
-    bodies: dict[tuple[bool, bool, float], list[Any]] = {}
-    actors = []
-    for shape, vertices, chosen in zip(shapes, worlds, subject, strict=True):
-        if shape.texture is not None:
-            actors.append((add_textured(plotter, shape, vertices), chosen))
-        else:
-            look = (chosen, shape.vertex_colours is not None, shape.colour[3])
-            bodies.setdefault(look, []).append(mesh_of(shape, vertices))
-    for (chosen, flat, opacity), meshes in bodies.items():
-        actors.append((plotter.add_mesh(joined(meshes), opacity=opacity, **style_of(flat)), chosen))
-    screens = [actor for actor, chosen in actors if not chosen] if any(subject) else []
+    in_lab = scale is not None and any(s.prim == scale.prim for s in shapes)
+    camera = camera or Camera(elevation_deg=LAB_ELEVATION_DEG if in_lab else Camera.elevation_deg)
+    screens, walls, points = add_still(plotter, shapes, worlds, scale)
     if camera.elevation_deg > 0 and all(
         s.link for s in shapes
     ):  # just below everything, in the colour of the background: only shadows on it are visible
@@ -228,10 +374,14 @@ def _draw(
         floor = pyvista.Disc(center=middle, inner=0, outer=reach, normal=(0, 0, 1), c_res=64)
         plotter.add_mesh(floor, color=BACKGROUND, ambient=1.0, diffuse=0.0, specular=0.0)
     light(plotter, everything)
-    aim(plotter, camera, around, size, bar=scale is not None and legend)
+    inner = inside(shapes, worlds)
+    for more in (False, True):  # as walls are cut, the camera comes nearer
+        around = np.vstack([*inner, *walls.shown()] or [everything])
+        aim(plotter, camera, around, size, bar=scale is not None and legend)
+        walls.cut(plotter.camera.position, points, more=more)
     if scale is not None and legend:
         add_bar(plotter, scale.name, scale.least, scale.greatest, scale.unit)
-    return screens
+    return screens if any(subject) else []
 
 
 def view_distance(
@@ -426,6 +576,11 @@ def aim(
     v = np.radians(camera.view_angle_deg) / 2
     h = np.arctan(np.tan(v) * size[0] / size[1] * (1 - BAR_SHARE * bar))
     distance = camera.distance_m or MARGIN * view_distance(everything, target, axes, (h, v))
+    for _ in range(3 * (camera.distance_m is None and camera.target is None)):  # perspective is uneven
+        right, up, back = ((everything - target) @ axes.T).T
+        off = [(ends.min() + ends.max()) / 2 for ends in (right / (distance - back), up / (distance - back))]
+        target = target + distance * (off @ axes[:2])
+        distance = MARGIN * view_distance(everything, target, axes, (h, v))
     plotter.camera.position = target + distance * axes[2]
     plotter.camera.SetWindowCenter(BAR_SHARE if bar and camera.distance_m is None else 0.0, 0.0)
     plotter.camera.focal_point = target

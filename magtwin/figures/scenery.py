@@ -19,11 +19,12 @@ from magtwin.figures.pictures import (
     Camera,
     Cutaway,
     add_bar,
+    add_still,
     add_text,
     aim,
-    bake,
     check_png,
     check_size,
+    inside,
     is_subject,
     joined,
     light,
@@ -54,6 +55,14 @@ TRAIL = ((0.065, 0.008, (32, 38, 45)), (0.05, 0.011, (255, 255, 255)), (0.026, 0
 """Half width [m], height above the floor [m] and colour of the trail's dark edge, white edge and middle. The
 middle has the colours of the field, as has the map below; one of the two edges differs from any of them."""
 
+NEAR_M = 2.5
+"""Distance from a path up to which all that stands there is in view, whole [m]."""
+
+BEHIND_M, ABOVE_M, AHEAD_M = 1.8, 1.1, 0.8
+"""Place of the chase camera behind and above the robot, and of its target ahead of it [m]."""
+
+_ABOVE = np.array([0.0, 0.0, 0.2])
+
 TRAIL_SPAN_M = 6.0
 """Extent of a path above which its trail is wider, to stay visible from farther away [m]."""
 
@@ -69,7 +78,7 @@ class View:
     """A camera for a run."""
 
     kind: str
-    """"top", "orbit", or "fixed"."""
+    """"orbit", "top", "chase", or "fixed"."""
 
     place: Vec3 = (0.0, 0.0, 0.0)
     """Position of a fixed camera [m]."""
@@ -107,20 +116,19 @@ class View:
         if self.kind == "top":
             return Camera(azimuth_deg=-90.0, elevation_deg=90.0)
         if self.kind == "fixed":
-            back = np.subtract(self.place, self.target)
-            distance = float(np.linalg.norm(back))
-            return Camera(
-                azimuth_deg=math.degrees(math.atan2(back[1], back[0])),
-                elevation_deg=math.degrees(math.asin(back[2] / distance)),
-                distance_m=distance,
-                target=self.target,
-                view_angle_deg=40.0,
-            )
+            return Camera.between(self.place, self.target)
         return Camera(azimuth_deg=40.0 + ORBIT_DEG_S * seen_s, elevation_deg=LAB_ELEVATION_DEG)
 
+    @staticmethod
+    def behind(p: Array, q_xyzw: ArrayLike) -> Camera:
+        """The chase camera of a robot at p [m], shape (3,)."""
+        forward = matrix_from_quat(q_xyzw)[:, 0] * (1, 1, 0)
+        place, target = p - BEHIND_M * forward + (0, 0, ABOVE_M), p + AHEAD_M * forward
+        return Camera.between((*map(float, place),), (*map(float, target),), 50.0)
 
-KINDS = ("orbit", "top")
-"""From above at a slant, slowly round the lab; straight from above, x to the right."""
+
+KINDS = ("orbit", "top", "chase")
+"""From above at a slant, slowly round the lab; straight from above, x to the right; behind the robot."""
 
 
 class Scenery:
@@ -260,20 +268,13 @@ class Scenery:
         scale: ColourScale | None,
     ) -> None:
         """Build the lab, one body per look, and each link of the robot."""
-        bodies: dict[tuple[bool, bool, float], list[Any]] = {}
         standing = [placed(s.vertices, links[s.link]) if s.link else s.vertices for s in still]
+        standing = [vertices.astype(float) for vertices in standing]
         self._subjects = [v for s, v in zip(still, standing, strict=True) if is_subject(s, scale)]
-        for shape, vertices in zip(still, standing, strict=True):
-            mesh, flat = mesh_of(shape, vertices), shape.vertex_colours is not None
-            if not flat and not fine:  # lighting it in each frame would double the work
-                bake(mesh)
-                flat = True
-            bodies.setdefault((is_subject(shape, scale), flat, shape.colour[3]), []).append(mesh)
-        self._screens = []
-        for (subject, flat, opacity), meshes in bodies.items():
-            actor = self.plotter.add_mesh(joined(meshes), opacity=opacity, **style_of(flat))
-            if not subject:
-                self._screens.append(actor)
+        self._screens, self._walls, self._points = add_still(
+            self.plotter, still, standing, scale, baked=not fine
+        )
+        self._things = inside(still, standing)
         self._actors: dict[str, Any] = {}
         self._links: dict[str, Link] = {}
         for name, link in moving.items():
@@ -291,7 +292,11 @@ class Scenery:
 
         p_xy = run[self._position][:, :2]
         rows = _steps(p_xy)
-        self._around = room_above(np.column_stack([p_xy[rows], np.zeros(len(rows))]))
+        box = room_above(np.column_stack([p_xy[rows], np.zeros(len(rows))]))
+        low, high = box.min(axis=0) - NEAR_M, box.max(axis=0) + NEAR_M
+        reach = [(v, (v.max(axis=0) > low) & (v.min(axis=0) < high)) for v in self._things]
+        near = [v for v, overlaps in reach if overlaps[:2].all()]
+        self._around = np.vstack([box, *near])
         wider = max(1.0, float(np.max(np.ptp(p_xy[rows], axis=0))) / TRAIL_SPAN_M)
         rows = rows[: int(np.searchsorted(run["t"][rows], self._times[-1], side="right"))]
         self._trail_t, self._ribbons = run["t"][rows], []
@@ -324,7 +329,10 @@ class Scenery:
         camera, around = self._view.camera((self._times[k] - self._times[0]) / self._speed), self._around
         if self._view.kind == "top":  # with the whole map, like a picture of the stage
             around = np.vstack([around, *self._subjects])
+        elif self._view.kind == "chase":
+            camera = self._view.behind(self._p[k], self._q[k])
         aim(self.plotter, camera, around, self._size, bar=self._bar)
+        self._walls.cut(self.plotter.camera.position, np.vstack([self._points, self._p[k] + _ABOVE]))
 
 
 def picture_of_run(

@@ -130,7 +130,10 @@ def test_a_browser_plays_a_run_and_shows_the_values_of_its_row(run, twin, lab_sc
 def test_keys_clicks_drags_and_the_address_seek(run, twin, lab_scene, tmp_path):
     script = """setTimeout(() => {
       const t = () => Math.round(10 * parseFloat(document.querySelector('[data-part="time"]').textContent));
-      const key = (key) => { document.body.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true })); return t(); };
+      const key = (key) => {
+        document.body.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
+        return t();
+      };
       const svg = document.querySelector("#player svg"), box = svg.getBoundingClientRect();
       svg.setPointerCapture = () => {};
       const point = (type, x) => {
@@ -138,7 +141,8 @@ def test_keys_clicks_drags_and_the_address_seek(run, twin, lab_scene, tmp_path):
         return t();
       };
       const told = [key("End"), key("Home"), key("ArrowRight"), key("ArrowRight"), key("ArrowLeft")];
-      told.push(point("pointerdown", (box.left + 46 + box.right - 10) / 2), point("pointermove", box.right - 10));
+      told.push(point("pointerdown", (box.left + 46 + box.right - 10) / 2));
+      told.push(point("pointermove", box.right - 10));
       document.querySelector('[value="top"]').click();
       told.push(document.querySelector('[value="top"]').getAttribute("aria-pressed"));
       document.title = told.join(" ");
