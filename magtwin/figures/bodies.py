@@ -21,7 +21,11 @@ UNKNOWN = np.iinfo(np.int32).min
 """Integer of a value that is not known."""
 
 MOST_TRIANGLES = 60_000
-"""Most triangles of a page. Shapes of more than a tenth are simplified, and the smallest are left out."""
+"""Most triangles of a page. Robots that have more than half of them are simplified, and so are other shapes
+that have a tenth; then the smallest ones are left out."""
+
+MIN_TRIANGLES = 12
+"""Triangles to which no shape of a robot is simplified further."""
 
 MAP_PRIM = "/AnomalyMap"
 """Part of the paths of prims that the page draws itself, as its floor."""
@@ -56,11 +60,17 @@ def bodies_of(arrays: dict[str, Array], stage: Path, runs: Sequence[Run]) -> tup
     bodies: dict[str, list[tuple[Shape, Array, Array]]] = {}
     about: dict[str, dict[str, Any]] = {}
     shapes = [s for s in read_shapes(shown) if MAP_PRIM not in s.prim and len(s.faces)]
+    shapes.sort(key=lambda s: (s.link not in robots, -float(np.ptp(s.vertices, axis=0).max())))
+    carried = sum(len(s.faces) for s in shapes if s.link in robots)
+    share = min(1.0, MOST_TRIANGLES / 2 / max(carried, 1))
     room, left_out = MOST_TRIANGLES, 0
-    for shape in sorted(
-        shapes, key=lambda s: (s.link not in robots, -float(np.ptp(s.vertices, axis=0).max()))
-    ):
-        points, faces = simplified(shape.vertices.astype(float), shape.faces, MOST_TRIANGLES // 10)
+    for shape in shapes:
+        most = (
+            max(MIN_TRIANGLES, int(share * len(shape.faces)))
+            if shape.link in robots
+            else MOST_TRIANGLES // 10
+        )
+        points, faces = simplified(shape.vertices.astype(float), shape.faces, most)
         if len(faces) > room:
             left_out += 1
             continue

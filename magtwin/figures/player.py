@@ -232,7 +232,7 @@ def floor_of(field: AnomalyMap) -> tuple[dict[str, Any], Integers, Integers]:
     """
     every = math.ceil(math.sqrt(field.valid[0].size / MOST_NODES))
     parts, rms = heading_harmonics(field, MOST_HARMONICS, ENOUGH_NT)
-    known = field.valid.all(axis=0)
+    known = np.logical_and.reduce(np.asarray(field.valid), axis=0)
     low, high = colour_limits(np.where(known, field.values_nt, np.nan))
     known, parts = known[::every, ::every], parts[:, ::every, ::every]
     (x, y), (dx, dy) = field.origin_m, np.multiply(field.cell_m, every)

@@ -268,8 +268,7 @@ class Scenery:
         scale: ColourScale | None,
     ) -> None:
         """Build the lab, one body per look, and each link of the robot."""
-        standing = [placed(s.vertices, links[s.link]) if s.link else s.vertices for s in still]
-        standing = [vertices.astype(float) for vertices in standing]
+        standing = [placed(s.vertices, links[s.link]) if s.link else s.vertices.astype(float) for s in still]
         self._subjects = [v for s, v in zip(still, standing, strict=True) if is_subject(s, scale)]
         self._screens, self._walls, self._points = add_still(
             self.plotter, still, standing, scale, baked=not fine
