@@ -298,16 +298,18 @@ class Chart {
       parts.push(svg("rect", { class: "lidar", x: left, y: TOP, width: wide, height: bottom - TOP }));
       if (!this.number && wide > 60) parts.push(svg("text", { x: left + 4, y: bottom - 4 }, "LiDAR on"));
     }
-    for (const value of ticks(low, high, Math.max(5, Math.floor((bottom - TOP) / 36)))) {
+    const step = niceStep((high - low) / Math.max(5, Math.floor((bottom - TOP) / 36)));
+    for (let k = Math.ceil(low / step); k * step <= high; k++) {
+      const value = k * step;
       parts.push(svg("line", { class: "grid", x1: LEFT, x2: width - RIGHT, y1: this.y(value), y2: this.y(value) }));
-      parts.push(svg("text", { x: LEFT - 6, y: this.y(value) + 4, "text-anchor": "end" }, short(value)));
+      parts.push(svg("text", { x: LEFT - 6, y: this.y(value) + 4, "text-anchor": "end" }, short(value, step)));
     }
     if (this.last) {
-      const step = STEPS_S.find((s) => end / s <= (width - LEFT) / 70) || end;
+      const wait = STEPS_S.find((s) => end / s <= (width - LEFT) / 70) || end;
       const [unit, name] = end >= 7200 ? [3600, "h"] : end >= 1200 ? [60, "min"] : [1, "s"];
-      for (let k = 0; k * step <= end; k++) {
-        const where = { x: this.x(k * step), y: height - 5, "text-anchor": k ? "middle" : "start" };
-        if (where.x < width - 14) parts.push(svg("text", where, k ? short((k * step) / unit) : `0 ${name}`));
+      for (let k = 0; k * wait <= end; k++) {
+        const where = { x: this.x(k * wait), y: height - 5, "text-anchor": k ? "middle" : "start" };
+        if (where.x < width - 14) parts.push(svg("text", where, k ? short((k * wait) / unit, wait / unit) : `0 ${name}`));
       }
     }
     if (chart.band) parts.push(svg("path", { class: "band", ...clip, d: this.bandPath() }));
@@ -365,13 +367,7 @@ class Chart {
 }
 
 const ink = (k) => (k ? "model" : "data");
-const short = (value) => said(Math.abs(value) < 1e-9 ? 0 : value, Math.abs(value) >= 10 || Number.isInteger(value) ? 0 : 2);
-
-function ticks(low, high, most) {
-  const step = niceStep((high - low) / most), values = [];
-  for (let k = Math.ceil(low / step); k * step <= high; k++) values.push(k * step);
-  return values;
-}
+const short = (value, step) => said(value, Math.max(0, Math.ceil(-Math.log10(step) - 1e-9))); // in the digits of a step
 
 // Stretches of rows in which a column is another number than `none`: first and last row of each.
 function spans(column, none = 0) {

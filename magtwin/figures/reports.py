@@ -22,6 +22,7 @@ from magtwin.figures.canvas import (
     legend_above,
     new_figure,
     short_pair,
+    small,
 )
 from magtwin.figures.page import Page, Section, Table
 from magtwin.figures.player import player_of
@@ -100,7 +101,7 @@ def page_of_runs(
     if _together([named.run for named in runs]):
         first, every = runs[0], [named.run for named in runs]
         still = path_picture(first.run, first.field, first.planned) if pictures else None
-        data = b"" if still is None else still.data
+        data = b"" if still is None else small(still.data)
         player = player_of(every, first.field, first.stage, still=data) if pictures else None
         title, verdict, lead = _title(first), first.run.report().verdict, _sentence(first.run)
         if len(runs) > 1:
