@@ -21,11 +21,11 @@ UNKNOWN = np.iinfo(np.int32).min
 """Integer of a value that is not known."""
 
 MOST_TRIANGLES = 60_000
-"""Most triangles of a page. Robots that have more than half of them are simplified, and so are other shapes
-that have a tenth; then the smallest ones are left out."""
+"""Most triangles of a page, of a robot's shapes half as many, and of another shape a tenth. A scene with more is
+simplified; then the smallest shapes are left out."""
 
 MIN_TRIANGLES = 12
-"""Triangles to which no shape of a robot is simplified further."""
+"""Triangles below which no shape is simplified."""
 
 MAP_PRIM = "/AnomalyMap"
 """Part of the paths of prims that the page draws itself, as its floor."""
@@ -62,15 +62,17 @@ def bodies_of(arrays: dict[str, Array], stage: Path, runs: Sequence[Run]) -> tup
     shapes = [s for s in read_shapes(shown) if MAP_PRIM not in s.prim and len(s.faces)]
     shapes.sort(key=lambda s: (s.link not in robots, -float(np.ptp(s.vertices, axis=0).max())))
     carried = sum(len(s.faces) for s in shapes if s.link in robots)
-    share = min(1.0, MOST_TRIANGLES / 2 / max(carried, 1))
+    others = sum(len(s.faces) for s in shapes) - carried
+    share = min(1.0, MOST_TRIANGLES / 2 / max(carried, 1))  # of its triangles that a shape of a robot keeps
+    share_of_others = min(1.0, (MOST_TRIANGLES - share * carried) / max(others, 1))
     room, left_out = MOST_TRIANGLES, 0
     for shape in shapes:
-        most = (
-            max(MIN_TRIANGLES, int(share * len(shape.faces)))
-            if shape.link in robots
-            else MOST_TRIANGLES // 10
-        )
-        points, faces = simplified(shape.vertices.astype(float), shape.faces, most)
+        robot = shape.link in robots
+        most = max(MIN_TRIANGLES, int((share if robot else share_of_others) * len(shape.faces)))
+        most = most if robot else min(most, MOST_TRIANGLES // 10)
+        points, faces = shape.vertices.astype(float), shape.faces
+        if room >= MIN_TRIANGLES:
+            points, faces = simplified(points, faces, most)
         if len(faces) > room:
             left_out += 1
             continue
