@@ -21,7 +21,7 @@ UNKNOWN = np.iinfo(np.int32).min
 """Integer of a value that is not known."""
 
 MOST_TRIANGLES = 60_000
-"""Most triangles of a page, of a robot's shapes half as many, and of another shape a tenth. A scene with more is
+"""Most triangles of a page; of its robots half as many, and of another shape a tenth. A scene with more is
 simplified; then the smallest shapes are left out."""
 
 MIN_TRIANGLES = 12
