@@ -16,7 +16,7 @@ BROWSER = (
     "chromium --headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader "
     "--ignore-gpu-blocklist --hide-scrollbars --window-size=1280,760 --virtual-time-budget=6000"
 )
-FRAMES, FRAME_S, WIDTH, COLOURS = 36, 0.22, 800, 96
+FRAMES, FRAME_S, WIDTH, COLOURS = 30, 0.25, 800, 96
 STILL_S = 45.4
 """Frames of the film, seconds that each is shown, its width [pixel] and colours; time of the PNG."""
 

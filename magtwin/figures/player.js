@@ -488,7 +488,7 @@ function stage(data, clock) {
   const gl = canvas.getContext("webgl2", { alpha: false, antialias: true, powerPreference: "low-power" });
   if (!gl) throw new Error("no WebGL 2");
   const make = programs(gl), lab = data.bodies.map((body) => bodyOf(gl, body, arrays));
-  const floor = map && floorOf(gl, make.floor, map, arrays), trails = trailsOf(gl, make.trail, robots), shade = shadowOf(gl);
+  const floor = map && floorOf(gl, make.floor, map, arrays), trails = trailsOf(gl, make.trail, robots, map || lab.length ? [1, 1, 1, 1] : [0.5, 0.54, 0.58, 1]), shade = shadowOf(gl);
   const rect = map ? [map.x, map.y, map.x + (map.nx - 1) * map.dx, map.y + (map.ny - 1) * map.dy] : [0, 0, -1, -1];
   const box = around(lab, robots, map && rect), sun = unit([0.35, -0.5, 1]), light = lightOf(box, sun);
   const camera = new Camera(canvas, box, clock);
@@ -687,7 +687,7 @@ function floorOf(gl, program, map, arrays) {
 const niceStep = (raw) => { const power = 10 ** Math.floor(Math.log10(raw)); return [1, 2, 5, 10].map((m) => m * power).find((s) => s >= raw); };
 
 // Driven paths as ribbons: up to now in colours of the reading minus the map, and from now on as a thin line.
-function trailsOf(gl, program, robots) {
+function trailsOf(gl, program, robots, later) {
   const colours = ramp(gl, DIVERGING), known = robots.flatMap(({ columns: { trail } }) => [...(trail || [])]);
   const sizes = known.filter((v) => v !== UNKNOWN).map(Math.abs).sort((u, v) => u - v);
   const most = sizes.length ? niceStep(Math.max(1, sizes[Math.floor(0.99 * (sizes.length - 1))])) : 1;
@@ -706,7 +706,7 @@ function trailsOf(gl, program, robots) {
     gl.enable(gl.POLYGON_OFFSET_FILL);
     for (const { array, count, edge } of paths) {
       gl.bindVertexArray(array);
-      [[wide * around, 0.011, [...edge, 1]], [wide, 0.013, [0, 0, 0, 0]], [wide / 4, 0.012, [1, 1, 1, 1], 1]].forEach((layer, k) => {
+      [[wide * around, 0.011, [...edge, 1]], [wide, 0.013, [0, 0, 0, 0]], [wide / 4, 0.012, later, 1]].forEach((layer, k) => {
         gl.polygonOffset(-4 - 2 * k, -4 - 2 * k);
         strip(count, ...layer);
       });

@@ -11,12 +11,10 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
@@ -27,6 +25,7 @@ from magtwin.report.verdict import Z_90, Tally
 from magtwin.run.compare import HEADINGS, POSITIONS
 from magtwin.run.figures import prediction_nt
 from magtwin.run.run import Run
+from magtwin.run.thinning import rows_shown
 
 MOST_ROWS = 8_000
 """Most readings of a page. Longer runs are cut into stretches: the page has the first reading of each and
@@ -130,12 +129,10 @@ def figures_of(runs: Sequence[Run]) -> list[tuple[str, str]]:
     tally, driven = Tally(), sum(float(figures.get("distance driven", 0)) for figures in found)
     words = [("duration", f"{max(float(figures['duration']) for figures in found):,.1f} s")]
     words += [("driven", f"{driven:,.1f} m")] if driven else []
-    errors = [error for run in runs for error in (off_m(run),) if error is not None]
-    if errors:
-        rms = math.sqrt(np.nanmean(np.concatenate(errors) ** 2))
-        words.append(("position error, RMS", f"{rms:.3f} m"))
-    else:
-        words.append(("readings", f"{sum(run.rows for run in runs):,}"))
+    off = [error for error in map(off_m, runs) if error is not None]
+    rms = math.sqrt(np.nanmean(np.concatenate(off) ** 2)) if off else math.nan
+    every = f"{sum(run.rows for run in runs):,}"
+    words.append(("position error, RMS", f"{rms:.3f} m") if off else ("readings", every))
     for run in runs:
         run.add_to(tally)
     if tally.readings:
@@ -151,18 +148,8 @@ def off_m(run: Run) -> Array | None:
     true = next((name for name in POSITIONS[:2] if name in run and np.isfinite(run[name]).any()), None)
     if true is None or "est_p_world_base" not in run:
         return None
-    return np.hypot(*(run["est_p_world_base"] - run[true])[:, :2].T)
-
-
-def rows_shown(run: Run, most: int = MOST_ROWS) -> NDArray[np.intp]:
-    """Rows that a page has: all, or of each stretch the first and that with the largest step."""
-    if run.rows <= most:
-        return np.arange(run.rows)
-    name = next((name for name in ("b_measured_nt", "b_total_nt", "t") if name in run), "t")
-    step = np.abs(np.convolve(np.nan_to_num(run[name]), [-0.5, 1, -0.5], "same"))
-    edges = np.linspace(0, run.rows, most // 2 + 1).astype(int)
-    worst = [a + int(np.argmax(step[a:b])) for a, b in pairwise(edges)]
-    return np.unique([*edges[:-1], *worst, run.rows - 1])
+    off = np.hypot(*(run["est_p_world_base"] - run[true])[:, :2].T)
+    return off if np.isfinite(off).any() else None
 
 
 def columns_of(run: Run, rows: Any, start_s: float) -> tuple[dict[str, Array], dict[str, str]]:

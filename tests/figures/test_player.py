@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from magtwin.cli import main
 from magtwin.figures.bodies import simplified
 from magtwin.figures.page import to_html
-from magtwin.figures.player import floor_of, player_of, rows_shown
+from magtwin.figures.player import MOST_ROWS, floor_of, player_of, rows_shown
 from magtwin.figures.reporting import report_runs
 from magtwin.figures.reports import NamedRun, page_of_runs
 from magtwin.localization.track import EST_COLUMNS
@@ -89,7 +89,7 @@ def opened(html, folder, *, at="", flags=()):
 
 def test_a_page_has_the_values_of_its_run_to_the_digit_that_it_shows(run, twin, lab_scene):
     _, arrays = unpacked(player_of([run], twin.field, lab_scene).block)
-    rows = rows_shown(run)
+    rows = rows_shown(run, MOST_ROWS)
     assert [f"{v / 100:.2f}" for v in arrays["reading"]] == [
         f"{b / 1000:.2f}" for b in run["b_measured_nt"][rows]
     ]
