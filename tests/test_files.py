@@ -94,7 +94,7 @@ def test_a_missing_file_is_refused_with_a_near_name_or_what_its_link_names(tmp_p
     for name, words in {
         "run.parquet": r"a link to 'gone\.parquet', which does not exist",
         "rum.parquet": r"no such run; did you mean 'run\.parquet'\?",
-        "mine.parquet": "no such run$",
+        "mine.parquet": "no such run; magtwin run lab makes",
     }.items():
         with pytest.raises(InputError, match=words):
             existing(tmp_path / name, "run")

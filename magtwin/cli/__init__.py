@@ -5,7 +5,8 @@ import sys
 from importlib import import_module
 
 from magtwin.cli import app as application
-from magtwin.cli.words import as_of_today
+from magtwin.cli.help import FLAGS, front, listing
+from magtwin.cli.words import GROUPS, as_of_today
 
 MODULES = {
     "bench": ("bench",),
@@ -48,9 +49,18 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the `magtwin` command; `arguments` default to those of the command line."""
     arguments = as_of_today(sys.argv[1:] if arguments is None else arguments)
     gc.set_threshold(GARBAGE)
-    name = arguments[0] if arguments else ""
-    load(name if name in MODULES and name != "completion" else None)
-    application.main(arguments)
+    name = arguments[0] if arguments else "-h"
+    group = name.lower() if name.title() in GROUPS and FLAGS & set(arguments) else ""
+    if name in FLAGS:
+        application.main(arguments, tell=front)
+    elif name.startswith("-") or name in MODULES:
+        load(name if name in MODULES and name != "completion" else None)
+        application.main(arguments)
+    elif group or name == "help":
+        load()
+        application.main(arguments, tell=lambda: listing(application.app, group))
+    else:
+        application.main(arguments, tell=lambda: application.refuse_command(arguments))
 
 
 def load(command: str | None = None) -> None:

@@ -137,15 +137,15 @@ def localize_live(
     settings
         Settings, such as prior:=global use_sim_time:=true.
     method
-        As for `magtwin localize`.
+        Name of a method, or MODULE:CLASS, as for `magtwin localize`.
     option
         Options of the method, as NAME=VALUE.
     map
         Map to use instead of the scene's, as for `magtwin localize`. none: no map.
     sensor
-        As for `magtwin localize`.
+        Values of the magnetometer's noise model, as for `magtwin localize`.
     odometry
-        As for `magtwin localize`.
+        Values of the odometry's noise model, as for `magtwin localize`.
     map_length_m
         Correlation length of the map's error that the method is told [m].
     """
@@ -158,26 +158,12 @@ def localize_live(
     values = settings_of(PARAMETERS, settings)
     announce(f"opening {scene}")
     twin = open_twin(scene, magnetometer="map-only")
-    problem = live_problem(
-        twin,
-        map,
-        sensor=_values("sensor", sensor, SensorModel),
-        odometry=OdometryModel(**_values("odometry", odometry, OdometryModel)),
-        map_length_m=map_length_m,
-        seed=seed,
-    )
-    options = _values("option", option)
+    told: Any = {"sensor": _values("sensor", sensor, SensorModel), "map_length_m": map_length_m}
+    told["odometry"] = OdometryModel(**_values("odometry", odometry, OdometryModel))
+    problem = live_problem(twin, map, seed=seed, **told)
+    options: Any = {"method": method, "options": _values("option", option), "problem": problem}
     with where.bus("magtwin_localize", sim_time=values["use_sim_time"], duration_s=duration_s) as bus:
-        LocalizerNode(
-            twin,
-            bus,
-            values,
-            method=method,
-            options=options,
-            problem=problem,
-            frame_prefix=frame_prefix or "",
-            say=announce,
-        )
+        LocalizerNode(twin, bus, values, frame_prefix=frame_prefix or "", say=announce, **options)
         announce(f"localizing by {bus.backend}; Ctrl-C ends")
         spin(bus, duration_s)
     return Done()

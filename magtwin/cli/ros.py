@@ -67,12 +67,7 @@ class Node:
 
     @contextmanager
     def bus(
-        self,
-        name: str,
-        *,
-        sim_time: bool = False,
-        duration_s: float | None = None,
-        several: bool = False,
+        self, name: str, *, sim_time: bool = False, duration_s: float | None = None, several: bool = False
     ) -> "Iterator[Bus]":
         """The node of one robot or several, until the end of the block or Ctrl-C."""
         if duration_s is not None and not duration_s > 0:
@@ -82,16 +77,10 @@ class Node:
         from magtwin.compiled import steady
         from magtwin.ros.bus import names_of, open_bus
 
-        bus = open_bus(
-            self.node_name or name,
-            names=names_of(
-                ("" if several else "robot") if self.namespace is None else self.namespace, self.remap
-            ),
-            sim_time=sim_time,
-            backend=self.backend,
-            domain=self.domain,
-            discovery=self.discovery,
-        )
+        space = ("" if several else "robot") if self.namespace is None else self.namespace
+        place: Any = {"backend": self.backend, "domain": self.domain, "discovery": self.discovery}
+        names = names_of(space, self.remap)
+        bus = open_bus(self.node_name or name, names=names, sim_time=sim_time, **place)
         _announce_reach(bus)
         signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a script ignore it
         try:
@@ -175,20 +164,9 @@ def sim(
     opening: Any = {"network": network, "magnetometer": kind, "model_error": model_error}
     twin = with_plant(open_twin(scene, lab=lab, map_layer=map_layer, **opening), plant)
     with where.bus("magtwin_sim", duration_s=duration_s, several=bool(twin.scene.others)) as bus:
-        node = Simulator(
-            twin,
-            bus,
-            seed=seed,
-            session=session,
-            speed=pace,
-            rate_hz=rate_hz,
-            units=out_unit or "T",
-            lidar=lidar,
-            magnetometer=magnetometer != "none",
-            frame_prefix=frame_prefix,
-            tf=tf,
-            say=announce,
-        )
+        options: Any = {"seed": seed, "session": session, "speed": pace, "rate_hz": rate_hz, "lidar": lidar}
+        options |= {"units": out_unit or "T", "frame_prefix": frame_prefix, "tf": tf, "say": announce}
+        node = Simulator(twin, bus, magnetometer=magnetometer != "none", **options)
         announce(f"simulating by {bus.backend} at {pace:g} x real time; Ctrl-C ends")
         with progress("Simulating", "s") if duration_s else silence() as advance:
 
@@ -242,13 +220,11 @@ def magnetometer(
 
     values = settings_of(PARAMETERS, settings)
     announce(f"opening {scene}")
-    twin = open_twin(
-        scene, lab=lab, map_layer=map_layer, network=network, model_error=False
-    )  # it predicts for a robot that reads
+    opening: Any = {"lab": lab, "map_layer": map_layer, "network": network}
+    twin = open_twin(scene, model_error=False, **opening)  # it predicts for a robot that reads
     with where.bus("magtwin_magnetometer", sim_time=values["use_sim_time"], duration_s=duration_s) as bus:
-        Magnetometer(
-            twin, bus, values, online=online, measured=measured, frame_prefix=frame_prefix or "", say=announce
-        )
+        options: Any = {"online": online, "measured": measured, "frame_prefix": frame_prefix or ""}
+        Magnetometer(twin, bus, values, say=announce, **options)
         announce(f"reading by {bus.backend}; Ctrl-C ends")
         spin(bus, duration_s)
     return Done()
@@ -292,19 +268,9 @@ def follow(
     way = resolve_path(path)
     drive = _drive_of(asset)
     with where.bus("magtwin_follow", sim_time=sim_time) as bus:
-        node = Follower(
-            way,
-            drive,
-            bus,
-            speed=speed,
-            controller=controller,
-            source=source,
-            laps=laps,
-            continuous=continuous,
-            commands=commands,
-            stamps=stamps,
-            say=announce,
-        )
+        options: Any = {"speed": speed, "controller": controller, "source": source, "laps": laps}
+        options |= {"continuous": continuous, "commands": commands, "stamps": stamps, "say": announce}
+        node = Follower(way, drive, bus, **options)
         announce(f"driving {way.name}, {way.length:.1f} m, by {bus.backend}; Ctrl-C ends")
         try:
             with progress(f"Driving {way.name}") as advance:
@@ -403,16 +369,8 @@ def replay(
     whole = read_run(run)
     twin = None if scene is None else open_twin(scene, model_error=False)
     with where.bus("magtwin_replay") as bus:
-        player = Player(
-            whole,
-            bus,
-            twin,
-            units=out_unit or "T",
-            topics=topic,
-            stamps=stamps,
-            frame_prefix=frame_prefix or "",
-            tf=tf,
-        )
+        options: Any = {"units": out_unit or "T", "topics": topic, "stamps": stamps, "tf": tf}
+        player = Player(whole, bus, twin, frame_prefix=frame_prefix or "", **options)
         announce(f"replaying {whole['t'][-1] - whole['t'][0]:.0f} s by {bus.backend}; Ctrl-C ends")
         step("Replaying")
         count = player.run(speed=pace)

@@ -6,7 +6,8 @@ from typing import Any, Literal
 
 from magtwin.errors import InputError
 from magtwin.files.file import existing
-from magtwin.files.kinds import SCENE_FOLDER, SURVEY, USD_SUFFIXES, kind_of, scene_file, shipped_or
+from magtwin.files.kinds import SURVEY, USD_SUFFIXES, kind_of, shipped_or
+from magtwin.files.outputs import check_free, output
 
 Show = Literal["charts", "picture", "field", "gradient", "variance", "mask", "headings"]
 
@@ -62,7 +63,7 @@ def draw(
     suffix = out.suffix.lower()
     if not any(suffix in known for known in SUFFIXES.values()):
         raise InputError(f"{out}: a picture ends in .png, .svg or .jpg, and a film in .mp4 or .gif")
-    paths = [existing(_inside(shipped_or(file)), "run, stage, map or recording") for file in files]
+    paths = [existing(shipped_or(file), "run, stage, map or recording") for file in files]
     way = _way(paths, suffix, show, given)
     kind, what, takes = WAYS[way]
     if suffix not in SUFFIXES[kind]:
@@ -75,19 +76,12 @@ def draw(
 
     from PIL import Image
 
-    from magtwin.files.outputs import output
-
     with TemporaryDirectory() as folder, output(out, force=force) as aside:
         picture = Path(folder) / "picture.png"
         messages = _draw(way, paths, picture, show, advance=advance, **given)
         with Image.open(picture) as image:
             image.convert("RGB").save(aside, "JPEG", quality=92)
     return out, messages
-
-
-def _inside(file: Path) -> Path:
-    """The stage in the folder of a scene; another path as it is."""
-    return scene_file(file) if file.is_dir() and kind_of(file) is SCENE_FOLDER else file
 
 
 def _way(paths: Sequence[Path], suffix: str, show: Show | None, given: dict[str, Any]) -> str:
@@ -158,10 +152,19 @@ def _draw(
         save(_charts(paths[0], given.get("scene")), out, force=force)
     elif way == "film":
         views.film(paths[0], out, force=force, advance=advance, **given)
+    elif way == "recording":
+        from magtwin.io.rerun.viewer import screenshot
+
+        given["time_s"] = given.pop("at_s", None)
+        return screenshot(paths[0], check_free(out, force=force), force=force, **given)
+    elif way == "stage":
+        from magtwin.figures.pictures import picture_of_stage
+        from magtwin.figures.scenery import View
+
+        given |= {"camera": View.of(given["camera"]).camera()} if "camera" in given else {}
+        picture_of_stage(paths[0], out, force=force, **given)
     else:
-        camera = given.pop("camera", "orbit" if way == "moment" else None)
-        time_s = given.pop("at_s", None)
-        return views.picture(paths[0], out, force=force, camera=camera, time_s=time_s, **given)
+        views.picture(paths[0], out, time_s=given.pop("at_s", None), force=force, **given)
     return ()
 
 

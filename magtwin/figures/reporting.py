@@ -13,7 +13,7 @@ from magtwin.figures.player import player_of
 from magtwin.figures.reports import OVERVIEW, NamedRun, overview_of, page_of_runs
 from magtwin.figures.runs import still_of
 from magtwin.files.outputs import check_free, output
-from magtwin.io.formats import read_run
+from magtwin.io.formats import read_run, runs_in
 from magtwin.io.provenance import map_of, planned_of
 from magtwin.report.summary import span
 from magtwin.run.run import Run
@@ -104,13 +104,6 @@ def embedded(run: Run, scene: Source | None, height: int) -> Embedded:
 
     named = _named("run", run, None if scene is None else scene_file(scene), None)
     return Embedded(to_html(page_of_runs([named])), height)
-
-
-def runs_in(path: Path) -> list[Path]:
-    """The runs in a folder that `magtwin sweep` made, or the one run that a path names."""
-    if not (path / "runs.csv").is_file():
-        return [path]
-    return sorted(path.glob("run_*.parquet"))
 
 
 def _each(files: Sequence[Path], scene: Path | None, progress: Progress) -> Iterator[NamedRun]:

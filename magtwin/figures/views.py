@@ -46,49 +46,25 @@ def view(files: Sequence[Source], *, scene: Source | None = None) -> None:
 
 
 def picture(
-    file: Source,
-    out: Source,
-    *,
-    camera: str | None = None,
-    time_s: float | None = None,
-    size: tuple[int, int] = (1600, 1000),
-    scene: Source | None = None,
-    force: bool = False,
-) -> Sequence[str]:
-    """Draw a moment of a run in its lab, a stage, or a recording in the Rerun viewer, as a PNG.
+    file: Source, out: Source, *, scene: Source | None = None, force: bool = False, **options: Any
+) -> None:
+    """Draw a moment of a run in its lab, as a PNG.
 
     Args:
-        file: Run in any format, stage, or recording.
+        file: Run in any format.
         out: PNG to write.
-        camera: "orbit", "top" or "x,y,z:x,y,z" [m]. None: orbit; a recording uses the Rerun viewer.
-        time_s: Moment of a run or recording [s]. None: its end, or where the viewer starts.
-        size: Width and height [pixels].
-        scene: Scene of a run. None: the one of the metadata.
+        scene: Scene of the run. None: the one of the metadata.
         force: Whether an existing output is replaced.
-
-    Returns:
-        Messages of the Rerun viewer.
+        options: Of `magtwin.figures.scenery.picture_of_run`: camera, time_s, size.
 
     Raises:
         InputError: The file cannot be read or drawn, or the output exists.
     """
-    from magtwin.figures.pictures import check_png, picture_of_stage
-    from magtwin.figures.scenery import View, picture_of_run
-    from magtwin.files.kinds import shipped_or
+    from magtwin.figures.scenery import picture_of_run
 
-    file = existing(shipped_or(file), "run, stage or recording")
-    out = check_free(check_png(out), force=force)
-    if file.suffix.lower() == ".rrd" and camera is None and scene is None:
-        from magtwin.io.rerun.viewer import screenshot
-
-        return screenshot(file, out, time_s=time_s, size=size, force=force)
-    if file.suffix.lower() in STAGES and time_s is None and scene is None:
-        seen = None if camera is None else View.of(camera).camera()
-        picture_of_stage(file, out, size=size, camera=seen, force=force)
-    else:
-        run, stage = _run_and_scene(file, scene)
-        picture_of_run(run, stage, out, time_s=time_s, camera=camera or "orbit", size=size, force=force)
-    return ()
+    file, out = existing(file, "run"), check_free(out, force=force)
+    run, stage = _run_and_scene(file, scene)
+    picture_of_run(run, stage, out, force=force, **options)
 
 
 def film(

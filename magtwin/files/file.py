@@ -42,6 +42,16 @@ _SPECIAL = (
 """Kinds of files that may never end, or never begin."""
 
 
+MADE_BY = {
+    "run": "magtwin run lab makes run/run.parquet",
+    "run, stage, map or recording": "magtwin run lab makes run/run.parquet, and lab is a stage",
+    "recording": "magtwin sweep lab makes runs",
+    "weights file": "magtwin train makes one",
+    "data set": "magtwin dataset build makes one",
+}
+"""What makes a file of a kind, for one that is missing."""
+
+
 def existing(path: str | os.PathLike[str], what: str) -> Path:
     """`path` if it is a regular file or a folder. Every file that a user names passes through here.
 
@@ -53,13 +63,17 @@ def existing(path: str | os.PathLike[str], what: str) -> Path:
     try:
         mode = path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
+        made = f"; {MADE_BY[what]}" if what in MADE_BY else ""
         if not path.parent.is_dir():
-            raise InputError(f"{path}: no such {what}; there is no folder {str(path.parent)!r}") from None
+            text = f"{path}: no such {what}; there is no folder {str(path.parent)!r}{made}"
+            raise InputError(text) from None
         if path.is_symlink():
             text = f"a link to {str(path.readlink())!r}, which does not exist; restore that, or give another"
             raise InputError(f"{path}: no such {what}: {text}") from None
         near = _near_file(path)
-        raise InputError(f"{path}: no such {what}" + (f"; did you mean {near!r}?" if near else "")) from None
+        raise InputError(
+            f"{path}: no such {what}" + (f"; did you mean {near!r}?" if near else made)
+        ) from None
     except ValueError as error:  # a null character
         raise InputError(f"{str(path)!r}: no name of a {what}: {error}") from error
     except OSError as error:

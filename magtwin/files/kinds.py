@@ -158,25 +158,42 @@ def expected(path: str | os.PathLike[str], noun: str) -> Path:
 def scene_file(scene: str | Path) -> Path:
     """The file of a stage, of a folder that `author_scene` wrote, or of a shipped scene's name such as "lab".
 
+    A folder goes before a shipped scene of its name only if it holds a scene. `./lab` is always the folder.
+
     Raises:
         InputError: The file is missing, there is no scene of that name, or it is a TOML.
     """
     file = Path(scene)
     if file.suffix.lower() == ".toml" and kind_of(file) in (None, TOML, SCENE_TOML):
-        raise InputError(f"{scene}: describes a scene; author it first: magtwin scene {scene} --out FOLDER")
+        author = f"magtwin scene {scene} --out {file.with_suffix('')}"
+        raise InputError(
+            f"{scene}: describes a scene; author it first: {author}; then give its folder, "
+            f"as in magtwin run {file.with_suffix('')}"
+        )
     inside = file / f"{file.resolve().name}.usda"
     if inside.is_file():
         return inside
+    stages = _shipped_stages()
+    if str(scene) in stages and not file.is_file():
+        return stages[str(scene)]
     if file.suffix or file.exists() or len(file.parts) > 1:
         return expected(file, "scene")
-    return find("scene", str(scene), _shipped_stages())
+    if shipped("scenes").joinpath(f"{scene}.toml").is_file():
+        author = f"magtwin scene {scene} --map MAP.usdc --out {scene}"
+        raise InputError(f"{scene}: ships as a TOML without its map; author it first: {author}")
+    return find("scene", str(scene), stages)
 
 
 def shipped_or(file: str | Path) -> Path:
-    """The stage of a shipped scene's name such as "lab", if there is no file of that name; else the path."""
+    """The stage of a shipped scene's name such as "lab" or in the folder of a scene or robot; else the path.
+
+    A file goes before a shipped scene of its name, and so does a folder of a known kind.
+    """
     path = Path(file)
-    stage = _shipped_stages().get(str(file))
-    return path if stage is None or path.exists() else stage
+    stage, kind = _shipped_stages().get(str(file)), kind_of(path) if path.is_dir() else None
+    if kind in (SCENE_FOLDER, ROBOT_FOLDER):
+        return path / f"{path.resolve().name}.usda"
+    return path if stage is None or path.is_file() or kind else stage
 
 
 def _shipped_stages() -> dict[str, Path]:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from magtwin.errors import InputError, hint
 from magtwin.extend import Registry
-from magtwin.files.kinds import expected
+from magtwin.files.kinds import SWEEP, expected, kind_of
 from magtwin.run.run import Run, check_clock, check_size_of_numbers
 
 if TYPE_CHECKING:
@@ -201,6 +201,33 @@ def _function(function: Function | str) -> Function:
         return function
     module, _, name = function.partition(":")
     return getattr(importlib.import_module(module), name)
+
+
+def runs_in(path: Path) -> list[Path]:
+    """The runs of a folder, in any format; [path] if it is a file, a bag or a folder of one run.
+
+    Raises:
+        InputError: It has the runs.csv of `magtwin sweep` alone.
+    """
+    if not path.is_dir():
+        return [path]
+    if kind_of(path) is SWEEP:
+        inside = sorted(path.glob("run_*.parquet"))
+        if not inside:
+            raise InputError(f"{path}: its runs.csv stands alone, without run_*.parquet")
+        return inside
+    parts = any(next(path.glob(one), None) for one in ("*.db3", "part-*.parquet"))
+    inside = [] if parts or kind_of(path) else sorted(path.glob("[!.]*"))
+    return [
+        file
+        for file in inside
+        if _holds_one(file) or (file.suffix.lower() in FORMATS and ".scans." not in file.name)
+    ] or [path]
+
+
+def _holds_one(folder: Path) -> bool:
+    """Whether a folder holds one run."""
+    return (folder / "metadata.yaml").is_file() or (folder / "run.parquet").is_file()
 
 
 def _in_folder(folder: Path) -> tuple[Path, Format]:

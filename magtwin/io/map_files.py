@@ -6,7 +6,7 @@ from pathlib import Path
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files.file import existing
-from magtwin.files.kinds import expected, scene_file
+from magtwin.files.kinds import expected, scene_file, shipped_or
 
 Source = str | os.PathLike[str]
 
@@ -36,8 +36,8 @@ def map_file(source: Source) -> Path:
         InputError: There is no such file or scene.
     """
     path = Path(source)
-    if path.is_file() or (path.is_dir() and not (path / f"{path.resolve().name}.usda").is_file()):
-        return path
+    if path.exists():
+        return shipped_or(path)
     if path.suffix or (len(path.parts) > 1 and not path.exists()):
         return existing(path, "map")
     try:

@@ -19,7 +19,7 @@ from magtwin.field.maps.map import AnomalyMap
 from magtwin.files.file import existing, read_text, sha256
 from magtwin.files.kinds import scene_file
 from magtwin.files.outputs import check_free, output, transaction
-from magtwin.io.formats import read_run
+from magtwin.io.formats import read_run, runs_in
 from magtwin.io.map_files import map_file, open_map
 from magtwin.learn.data.alignment import Alignment
 from magtwin.learn.data.dataset import MANIFEST, Dataset, open_dataset
@@ -116,20 +116,16 @@ def sources_of_files(
 ) -> list[Source]:
     """Files of recordings as sources of a data set; the arguments are those of `build_dataset`.
 
+    A folder stands for all of its runs.
+
     A recording has the name of its file, preceded by that of its folder if two files have one name.
     """
 
     def named(word: str) -> str:
         return re.sub(r"\.\.+", ".", re.sub(r"[^A-Za-z0-9_.+-]", "_", word)).lstrip(".+-")[:180] or "_"
 
-    paths: list[Path] = []
-    for path in map(Path, [files] if isinstance(files, str | os.PathLike) else files):
-        inside = [path]
-        if (path / "runs.csv").is_file():
-            inside = sorted(path.glob("run_*.parquet"))
-            if not inside:
-                raise InputError(f"{path}: its runs.csv stands alone, without run_*.parquet")
-        paths += inside
+    given = map(Path, [files] if isinstance(files, str | os.PathLike) else files)
+    paths = [inside for path in given for inside in runs_in(path)]
     short = [named(existing(path, "recording").resolve().stem) for path in paths]
     long = [named(f"{path.resolve().parent.name}_{path.resolve().stem}") for path in paths]
     names = [name if short.count(name) == 1 else other for name, other in zip(short, long, strict=True)]

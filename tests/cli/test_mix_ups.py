@@ -62,7 +62,7 @@ SLOTS = {
     "scene --urdf FILE --out new": {"robot.urdf", "map.usdc"},
     "robot FILE --out new": {"robot.urdf"},
     "robot robot.urdf --settings FILE --out new": {"settings.toml"},
-    "info FILE": RUNS | {"net.safetensors", "net.pth", "net.onnx", "survey"},
+    "info FILE": RUNS | {"room", "cart", "net.safetensors", "net.pth", "net.onnx", "survey"},
     "convert FILE new.csv": RUNS,
     "compare FILE run.npz": RUNS,
     "compare run.npz FILE": RUNS,

@@ -1,5 +1,8 @@
 """The name of a shipped scene stands for its stage and its map, and a missing scene is refused."""
 
+import shutil
+from pathlib import Path
+
 import pytest
 
 from magtwin import load_run
@@ -7,7 +10,9 @@ from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.figures.reporting import report_runs
 from magtwin.figures.views import film
+from magtwin.files.kinds import scene_file, shipped_or
 from magtwin.io.convert import convert_run
+from magtwin.io.formats import runs_in
 from magtwin.io.map_files import map_file, open_map
 from magtwin.io.provenance import repeat_of
 from magtwin.tasks.learning import build_dataset, map_of_scene
@@ -64,3 +69,23 @@ def test_a_file_goes_before_the_name_of_a_shipped_scene(elsewhere):
     assert map_file("lab") == (elsewhere / "lab").relative_to(elsewhere)
     with pytest.raises(InputError, match=r"labb: no map layer, .*did you mean 'lab'"):
         map_file("labb")
+
+
+def test_a_folder_goes_before_the_name_of_a_shipped_scene_only_if_it_is_of_a_kind(elsewhere, lab_scene):
+    (elsewhere / "lab").mkdir()
+    for found in (map_file("lab"), scene_file("lab"), shipped_or("lab")):
+        assert found.parts[-3:] == ("scenes", "lab", "lab.usda")
+    with pytest.raises(InputError, match="USD|folder|scene"):
+        scene_file("./lab/")
+    shutil.copytree(lab_scene.parent, "lab", dirs_exist_ok=True)
+    assert scene_file("lab") == shipped_or("lab") == Path("lab/lab.usda")
+    with pytest.raises(InputError, match=r"author it first: magtwin scene aprilab --map MAP\.usdc"):
+        scene_file("aprilab")
+
+
+def test_a_folder_of_runs_in_any_format_stands_for_them(run, elsewhere):
+    for name in ("a.parquet", "b.npz", "c.mcap", "c.scans.parquet"):
+        load_run(run).save(name)
+    Path("notes.txt").touch()
+    assert [file.name for file in runs_in(Path())] == ["a.parquet", "b.npz", "c.mcap"]
+    assert runs_in(run) == [run]

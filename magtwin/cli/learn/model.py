@@ -1,7 +1,7 @@
 """`magtwin model`: convert, export, widen and calibrate networks; `learn.compensate` adds its own."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import App, Parameter
 
@@ -127,14 +127,7 @@ def calibrate(
 
     check_output(out, (".safetensors",), "a network", force=force)
     step("Calibrating")
-    calibrated = calibrate_files(
-        weights,
-        run,
-        anomaly_map=map,
-        duration_s=duration_s,
-        pose_sd_m=pose_sd_m,
-        pose_from_map=pose_from_map,
-        out=out,
-        force=force,
-    )
+    poses: Any = {"pose_sd_m": pose_sd_m, "pose_from_map": pose_from_map}
+    options: Any = {"anomaly_map": map, "duration_s": duration_s, "out": out, "force": force}
+    calibrated = calibrate_files(weights, run, **poses, **options)
     return Done(calibrated.report(str(out)), out)

@@ -11,7 +11,7 @@ from magtwin.errors import InputError
 map_app = App(name="map", help="Import, fit, survey, validate and compare anomaly maps.")
 app.command(map_app)
 
-LAYERS = (".usdc", ".usd")
+LAYERS = (".usdc", ".usd", ".usda")
 PICTURES = (".png", ".svg")
 
 MapFile = Annotated[

@@ -1,6 +1,9 @@
 """`magtwin new` and `magtwin scene`."""
 
+import re
 import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -113,7 +116,8 @@ def scene(
             else:
                 _check_unused(magnetometer=magnetometer, controllers=controllers, package=package, arg=arg)
                 announce(f"Reading {spec}")
-                read = scene_from_toml(spec, **choices)
+                with _keys_for_flags():
+                    read = scene_from_toml(spec, **choices)
         announce("Authoring the stage")
         root = author_scene(read, out, force=force)
         made = [s.robot for s in read.robots if s.robot.asset.is_relative_to(Path(workshop).resolve())]
@@ -122,8 +126,23 @@ def scene(
     return Done(replace(report, metadata={**report.metadata, **notes}), root, text=text)
 
 
+@contextmanager
+def _keys_for_flags() -> Iterator[None]:
+    """Names the keys of a TOML where a refusal of its URDF names flags of `magtwin robot`."""
+    try:
+        yield
+    except InputError as error:
+        packages = r'packages = {\1 = "FOLDER"} below [robot.conversion]'
+        told = re.sub(r"--package (\S+)=FOLDER", packages, str(error))
+        raise InputError(
+            re.sub("`skip_missing_includes[^`]*`", "skip_missing_includes = true", told)
+        ) from error
+
+
 def _check_unused(**options: object) -> None:
     """Refuse options that only matter with --urdf."""
     used = [f"--{name}" for name, value in options.items() if value is not None]
     if used:
-        raise InputError(f"{', '.join(used)} goes with --urdf; a TOML names these in [robot]")
+        raise InputError(
+            f"{', '.join(used)} goes with --urdf; a TOML has keys for these below [robot.conversion]"
+        )

@@ -51,15 +51,15 @@ def save_map(field: AnomalyMap, path: str | os.PathLike[str], *, force: bool = F
 
     Args:
         field: The map.
-        path: File to make, .usdc or .usd.
+        path: File to make: .usdc, .usd, or .usda, which is text and ten times as large.
         force: Whether to replace an existing file.
 
     Raises:
         InputError: The file exists and `force` was not given, or has another suffix; or a parameter of the
             map cannot be written as JSON.
     """
-    if Path(path).suffix.lower() not in (".usdc", ".usd"):
-        raise InputError(f"{path}: a map layer ends in .usdc or .usd")
+    if Path(path).suffix.lower() not in (".usdc", ".usd", ".usda"):
+        raise InputError(f"{path}: a map layer ends in .usdc, .usd or .usda")
     values = {**grid_values(field), **_values(field)}
     about = f"Magnetic anomaly map {field.name}: total field over x, y and heading. {field.source}"
     with new_stage(path, about, force=force) as stage:
