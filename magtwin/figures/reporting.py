@@ -10,7 +10,7 @@ from magtwin.errors import InputError, MismatchWarning
 from magtwin.figures.canvas import small
 from magtwin.figures.page import Embedded, Page, Still, to_html, write_page
 from magtwin.figures.player import player_of
-from magtwin.figures.reports import OVERVIEW, NamedRun, overview_of, page_of_runs
+from magtwin.figures.reports import OVERVIEW, NamedRun, overview_of, page_of_runs, together
 from magtwin.figures.runs import still_of
 from magtwin.files.outputs import check_free, output
 from magtwin.io.formats import read_run, runs_in
@@ -50,7 +50,7 @@ def report_runs(
 
     out = check_free(out, force=force)
     scene = None if scene is None else scene_file(scene)
-    files = [file for source in runs for file in runs_in(Path(source))]
+    files = _files(runs)
     if not out.suffix:
         _write_folder(files, out, scene, force, progress)
         return
@@ -60,6 +60,13 @@ def report_runs(
         stills = (_still(run, f"#run-{k}") for k, run in enumerate(named[:MOST_STILLS]))
         page = replace(page, stills=tuple(still for still in stills if still is not None))
     write_page(page, out, force=force)
+
+
+def usual_name(runs: Sequence[Source]) -> Path:
+    """Usual name of a report: a page, or a folder for the runs in a folder, such as those of a sweep."""
+    files = _files(runs)
+    page = len(runs) > 1 or len(files) == 1 or together([read_run(file) for file in files[:2]])
+    return Path("report.html" if page else "report")
 
 
 def report_scene(scene: Path, out: Source, *, force: bool = False) -> Path:
@@ -104,6 +111,12 @@ def embedded(run: Run, scene: Source | None, height: int) -> Embedded:
 
     named = _named("run", run, None if scene is None else scene_file(scene), None)
     return Embedded(to_html(page_of_runs([named])), height)
+
+
+def _files(runs: Sequence[Source]) -> list[Path]:
+    """The files of runs; of the same run in several formats, the first."""
+    files = [file for source in runs for file in runs_in(Path(source))]
+    return list({file.with_suffix(""): file for file in reversed(files)}.values())[::-1]
 
 
 def _each(files: Sequence[Path], scene: Path | None, progress: Progress) -> Iterator[NamedRun]:

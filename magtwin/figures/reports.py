@@ -98,7 +98,7 @@ def page_of_runs(
     for k, named in enumerate(runs):
         sections.append(_section(named))
         advance(k + 1)
-    if _together([named.run for named in runs]):
+    if together([named.run for named in runs]):
         first, every = runs[0], [named.run for named in runs]
         still = path_picture(first.run, first.field, first.planned) if pictures else None
         data = b"" if still is None else small(still.data)
@@ -116,7 +116,7 @@ def page_of_runs(
     return Page(f"{len(runs)} runs", lead, tuple(sections), overview)
 
 
-def _together(runs: Sequence[Run]) -> bool:
+def together(runs: Sequence[Run]) -> bool:
     """Whether runs are those of different robots that drove in one scene at the same time, or only one."""
     facts = {tuple(run.metadata.get(name) for name in ("scene_sha256", "seed", "lab")) for run in runs}
     robots = {run.metadata.get("robot") for run in runs} - {None}

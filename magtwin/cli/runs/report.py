@@ -43,11 +43,9 @@ def report(
         Page to write (.html), which needs no other file; or a folder, with index.html and a page of each run.
         Default: report.html; for the folder of a sweep, the folder report.
     """
-    from magtwin.figures.reporting import report_runs
-    from magtwin.io.formats import runs_in
+    from magtwin.figures.reporting import report_runs, usual_name
 
-    sweep = len(runs) == 1 and len(runs_in(runs[0])) > 1
-    out = out or Path("report" if sweep else "report.html")
+    out = out or usual_name(runs)
     check_output(out, (".html", ""), "a report", force=force)
     with progress("Reporting", "runs") as advance:
         report_runs(runs, out, scene=scene, force=force, progress=advance)
