@@ -114,9 +114,9 @@ def embedded(run: Run, scene: Source | None, height: int) -> Embedded:
 
 
 def _files(runs: Sequence[Source]) -> list[Path]:
-    """The files of runs; of the same run in several formats, the first."""
-    files = [file for source in runs for file in runs_in(Path(source))]
-    return list({file.with_suffix(""): file for file in reversed(files)}.values())[::-1]
+    """The files of runs; of a run that a folder has in several formats, the first."""
+    folders = [{file.with_suffix(""): file for file in runs_in(Path(source))[::-1]} for source in runs]
+    return [file for inside in folders for file in reversed(inside.values())]
 
 
 def _each(files: Sequence[Path], scene: Path | None, progress: Progress) -> Iterator[NamedRun]:
@@ -154,13 +154,12 @@ def _write_folder(
     with output(out, force=force) as aside:
         aside.mkdir()
         for k, named in enumerate(_each(files, scene, progress)):
-            page = page_of_runs([named])  # refuses an empty run
             rows.append(overview_of(named))
             links.append("")
             if k < MOST_STILLS:
                 file = f"{files[k].stem}.html"
                 file = f"{k:05}_{file}" if (aside / file).exists() or file == "index.html" else file
-                (aside / file).write_text(to_html(page), encoding="utf-8")
+                (aside / file).write_text(to_html(page_of_runs([named])), encoding="utf-8")
                 links[k] = quote(file)
                 still = _still(named, links[k])
                 stills += [] if still is None else [still]

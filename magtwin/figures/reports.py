@@ -76,14 +76,11 @@ class NamedRun:
     """Its scene, or None."""
 
 
-def page_of_runs(
-    runs: Sequence[NamedRun], *, pictures: bool = True, advance: Callable[[int], None] = lambda done: None
-) -> Page:
+def page_of_runs(runs: Sequence[NamedRun], *, advance: Callable[[int], None] = lambda done: None) -> Page:
     """A page about one run or several.
 
     Args:
         runs: The runs.
-        pictures: Whether to draw pictures.
         advance: Called with the number of runs that are drawn.
 
     Raises:
@@ -100,15 +97,13 @@ def page_of_runs(
         advance(k + 1)
     if together([named.run for named in runs]):
         first, every = runs[0], [named.run for named in runs]
-        still = path_picture(first.run, first.field, first.planned) if pictures else None
+        still = path_picture(first.run, first.field, first.planned)
         data = b"" if still is None else small(still.data)
-        player = player_of(every, first.field, first.stage, still=data) if pictures else None
+        player = player_of(every, first.field, first.stage, still=data)
         title, verdict, lead = _title(first), first.run.report().verdict, _sentence(first.run)
         if len(runs) > 1:
-            title, verdict = (
-                f"{len(runs)} robots in {first.run.metadata.get('scene', 'a scene')}",
-                _verdict(every),
-            )
+            verdict = _verdict(every)
+            title = f"{len(runs)} robots in {first.run.metadata.get('scene', 'a scene')}"
             lead = f"{', '.join(str(run.metadata['robot']) for run in every)} drove together."
         return Page(title, "" if verdict else lead, tuple(sections), player=player, verdict=verdict)
     overview = replace(OVERVIEW, rows=tuple(map(overview_of, runs)))

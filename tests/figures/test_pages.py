@@ -76,7 +76,7 @@ def test_a_page_is_well_formed_and_asks_nothing_of_any_other_place(page):
 def test_what_a_file_says_of_itself_is_text_and_nothing_else(runs):
     run = runs[0].with_metadata(path=EVIL, scene=EVIL, note=EVIL * 100, **{EVIL: EVIL})
     told = NamedRun(EVIL, run, note=EVIL)
-    page = page_of_runs([told, told], pictures=False)
+    page = page_of_runs([told, told])
     read = Reader(to_html(page))
     assert read.open == []
     assert "script" not in {tag for tag, _ in read.tags}
@@ -125,7 +125,7 @@ def test_commands_write_reports_and_comparisons(runs, lab_scene, tmp_path, capsy
 
 
 def test_what_cannot_be_reported_is_refused_and_nothing_is_written(runs, tmp_path):
-    page = page_of_runs([NamedRun("a", runs[0])], pictures=False)
+    page = page_of_runs([NamedRun("a", runs[0])])
     (tmp_path / "there.html").write_text("precious")
     with pytest.raises(InputError, match="exists already; give `force=True`"):
         write_page(page, tmp_path / "there.html")
