@@ -16,7 +16,7 @@ BROWSER = (
     "chromium --headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader "
     "--ignore-gpu-blocklist --hide-scrollbars --window-size=1280,760 --virtual-time-budget=6000"
 )
-FRAMES, FRAME_S, WIDTH, COLOURS = 30, 0.25, 800, 96
+FRAMES, FRAME_S, WIDTH, COLOURS = 30, 0.25, 800, 255
 STILL_S = 45.4
 """Frames of the film, seconds that each is shown, its width [pixel] and colours; time of the PNG."""
 
@@ -39,7 +39,9 @@ def main(page: Path, film: Path, still: Path) -> None:
         image = Image.open(io.BytesIO(shot(page, end * k / (FRAMES - 1)))).convert("RGB")
         image = image.resize((WIDTH, round(WIDTH * image.height / image.width)), Image.Resampling.LANCZOS)
         frames.append(image)
-    palette = frames[FRAMES // 2].quantize(COLOURS)  # one for all: what stands still keeps its colours
+    palette = frames[-1].quantize(
+        COLOURS, Image.Quantize.MAXCOVERAGE
+    )  # one for all: what stands still keeps its colours
     drawn = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     shown = [int(1000 * FRAME_S)] * (FRAMES - 1) + [2000]
     drawn[0].save(film, save_all=True, append_images=drawn[1:], duration=shown, loop=0, optimize=True)
