@@ -16,9 +16,9 @@ BROWSER = (
     "chromium --headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader "
     "--ignore-gpu-blocklist --hide-scrollbars --window-size=1280,760 --virtual-time-budget=6000"
 )
-FRAMES, FRAME_S, WIDTH, COLOURS = 30, 0.25, 800, 255
+FRAMES, FRAME_S, WIDTH = 24, 0.3, 800
 STILL_S = 45.4
-"""Frames of the film, seconds that each is shown, its width [pixel] and colours; time of the PNG."""
+"""Frames of the film, seconds that each is shown, its width [pixel]; time of the PNG in the run [s]."""
 
 
 def shot(page: Path, t: float) -> bytes:
@@ -30,6 +30,14 @@ def shot(page: Path, t: float) -> bytes:
         return out.read_bytes()
 
 
+def palette_of(image: Image.Image) -> Image.Image:
+    """256 colours of an image: its usual ones, and as many that span all of them, as a map's do."""
+    kinds = (Image.Quantize.MEDIANCUT, Image.Quantize.MAXCOVERAGE)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([v for kind in kinds for v in (image.quantize(128, kind).getpalette() or [])[:384]])
+    return palette
+
+
 def main(page: Path, film: Path, still: Path) -> None:
     """Write film and still."""
     end = float(re.search(r"<dt>duration</dt><dd>([\d,.]+) s", page.read_text("utf-8"))[1].replace(",", ""))  # type: ignore[index]
@@ -39,9 +47,7 @@ def main(page: Path, film: Path, still: Path) -> None:
         image = Image.open(io.BytesIO(shot(page, end * k / (FRAMES - 1)))).convert("RGB")
         image = image.resize((WIDTH, round(WIDTH * image.height / image.width)), Image.Resampling.LANCZOS)
         frames.append(image)
-    palette = frames[-1].quantize(
-        COLOURS, Image.Quantize.MAXCOVERAGE
-    )  # one for all: what stands still keeps its colours
+    palette = palette_of(frames[-1])  # one for all: what stands still keeps its colours
     drawn = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     shown = [int(1000 * FRAME_S)] * (FRAMES - 1) + [2000]
     drawn[0].save(film, save_all=True, append_images=drawn[1:], duration=shown, loop=0, optimize=True)
