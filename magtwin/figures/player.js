@@ -776,7 +776,8 @@ function around(lab, robots, rect) {
   for (const { columns: { x, y } } of robots) if (!rect && !lab.length && x) x.forEach((v, i) => v === UNKNOWN || add(v / 1000, y[i] / 1000));
   low[2] = 0;
   const focus = rect || [...low.slice(0, 2), ...high.slice(0, 2)];
-  return { low, high, focus, size: Math.max(0.5, Math.hypot(focus[2] - focus[0], focus[3] - focus[1])) };
+  const rise = rect || !lab.length ? 0 : high[2]; // what stands on a map need not be seen whole
+  return { low, high, focus, rise, size: Math.max(0.5, 1.2 * rise + Math.hypot(focus[2] - focus[0], focus[3] - focus[1])) };
 }
 
 // Orthographic view from the sun that holds the box.
@@ -843,7 +844,7 @@ class Camera {
   }
   now(aspect) {
     const { box, clock: { robot } } = this, angle = 0.7, place = robot && robot.place;
-    let target = [this.middle[0] + this.shift[0], this.middle[1] + this.shift[1], 0], up = [0, 0, 1];
+    let target = [this.middle[0] + this.shift[0], this.middle[1] + this.shift[1], box.rise / 2], up = [0, 0, 1];
     let far = (box.size * 1.02 * Math.max(1, 1.5 / aspect)) / this.zoom, { azimuth, elevation } = this;
     if (this.mode === "top") {
       const [w, h] = [box.focus[2] - box.focus[0], box.focus[3] - box.focus[1]];
