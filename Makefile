@@ -140,7 +140,7 @@ pictures: $(VENV)/.installed build/blender/.installed  ## Draw the pictures of R
 	$(BIN)/magtwin run scenes/lab/lab.usda --out build/pictures --force
 	$(BIN)/magtwin plot build/pictures/run.rrd --at 35 --size 1600x900 --out docs/recording.png --force
 	$(BIN)/magtwin report build/pictures/run.parquet --out build/pictures/run.html --force
-	chromium --headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --hide-scrollbars --window-size=1440,860 --virtual-time-budget=8000 --screenshot=$(CURDIR)/docs/page.png "file://$(CURDIR)/build/pictures/run.html#t=45.4"
+	$(BIN)/python docs/page_film.py build/pictures/run.html docs/page.gif docs/page.png
 	$(BIN)/magtwin plot build/pictures/run.parquet --camera 0.4,-1.6,6.1:0.4,-0.2,0 --size 560x350 --pace 10 --fps 8 --out docs/run.gif --force
 	MAGTWIN_BLENDER=$(CURDIR)/build/blender/bin/python $(BIN)/python docs/looks.py
 

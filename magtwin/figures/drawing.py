@@ -13,7 +13,12 @@ Show = Literal["charts", "picture", "field", "gradient", "variance", "mask", "he
 
 FILMS = (".mp4", ".gif")
 PHOTOS = (".jpg", ".jpeg")
-SUFFIXES = {"chart": (".png", ".svg", *PHOTOS), "map": (".png", ".svg", *PHOTOS, ".html"), "picture": (".png", *PHOTOS), "film": FILMS}
+SUFFIXES = {
+    "chart": (".png", ".svg", *PHOTOS),
+    "map": (".png", ".svg", *PHOTOS, ".html"),
+    "picture": (".png", *PHOTOS),
+    "film": FILMS,
+}
 
 WAYS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "charts": ("chart", "charts of a run", ("scene",)),

@@ -5,6 +5,7 @@ such as metadata and names, is escaped.
 """
 
 import base64
+import html
 import json
 import math
 import os
@@ -88,6 +89,15 @@ class Section:
 
 
 @dataclass(frozen=True)
+class Still:
+    """A small picture that leads to a run."""
+
+    picture: Picture
+    link: str
+    name: str
+
+
+@dataclass(frozen=True)
 class Page:
     """The content of a page, independent of its format."""
 
@@ -103,11 +113,31 @@ class Page:
     player: Player | None = None
     """What plays the run in its lab, above the sections; only HTML has it."""
 
+    stills: tuple[Still, ...] = ()
+    """Small pictures of the runs, above the overview; only HTML has them."""
+
     verdict: str = ""
     """What the page says, in one or a few lines; shown first."""
 
     figures: Sequence[tuple[str, str]] = ()
     """What is in it in about five figures, each with its name."""
+
+
+@dataclass(frozen=True, repr=False)
+class Embedded:
+    """A page for a notebook, in a frame of its own that can reach nothing outside of it."""
+
+    page: str
+    height: int
+    """Height of the frame [pixels]."""
+
+    def __repr__(self) -> str:
+        return f"Page of {len(self.page) / 1000:,.0f} kB; a notebook shows it"
+
+    def _repr_html_(self) -> str:
+        look = f"width: 100%; height: {self.height}px; border: 0"
+        frame = f'<iframe sandbox="allow-scripts" loading="lazy" title="A run" style="{look}"'
+        return f'{frame} srcdoc="{html.escape(self.page)}"></iframe>'
 
 
 def write_page(page: Page, path: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -151,9 +181,9 @@ def write_pages(page: Page, folder: str | os.PathLike[str], name: str, *, force:
             (aside / f"{name}{suffix}").write_text(writer(page), encoding="utf-8")
 
 
-def to_html(page: Page) -> str:
-    """A page as one HTML file."""
-    links = [f"#run-{k}" for k in range(len(page.sections))]
+def to_html(page: Page, links: Sequence[str] = ()) -> str:
+    """A page as one HTML file; its overview leads to `links`, by default to its sections."""
+    links = links or [f"#run-{k}" for k in range(len(page.sections))]
     return _TEMPLATES.get_template("page.html").render(page=page, links=links, css=CSS, version=__version__)
 
 

@@ -24,13 +24,15 @@ from magtwin.figures.canvas import (
     legend_above,
     new_figure,
     short_pair,
+    small,
 )
 from magtwin.figures.maps import FloorPlan, map_charts
 from magtwin.figures.page import Page, Section, Table, text_of
-from magtwin.figures.player import Player, player_of
+from magtwin.figures.player import player_of
 from magtwin.figures.runs import field_name, path_picture, position_name
 from magtwin.figures.style import DATA, MODEL, styled
 from magtwin.report.report import Report
+from magtwin.report.verdict import HOLDS_ONE, Tally
 from magtwin.run.compare import ERRORS, Agreement, Comparison, Traversals, errors_of, terms_of
 from magtwin.run.figures import prediction_nt
 from magtwin.run.run import COLUMNS, Metadata, Run
@@ -47,6 +49,14 @@ ALIGNED = {
     "placed": "by distance driven",
 }
 """How two traversals of a path are aligned."""
+
+OVERVIEW = Table(
+    "Overview",
+    ("run", "path", "seed", "readings", "duration [s]", "distance [m]", "MAE [nT]", "RMS [nT]", "events"),
+    (),
+    "MAE and RMS: error of b_measured_nt against the exact field, where that is known.",
+)
+"""One row per run, without its rows."""
 
 MEASURES = ("mean", "RMS", "mean absolute", "maximum")
 
@@ -72,14 +82,11 @@ class NamedRun:
     """Its scene, or None."""
 
 
-def page_of_runs(
-    runs: Sequence[NamedRun], *, pictures: bool = True, advance: Callable[[int], None] = lambda done: None
-) -> Page:
+def page_of_runs(runs: Sequence[NamedRun], *, advance: Callable[[int], None] = lambda done: None) -> Page:
     """A page about one run or several.
 
     Args:
         runs: The runs.
-        pictures: Whether to draw pictures.
         advance: Called with the number of runs that are drawn.
 
     Raises:
@@ -92,17 +99,37 @@ def page_of_runs(
             raise InputError(f"{named.name}: has no readings to report on")
     sections = []
     for k, named in enumerate(runs):
-        sections.append(_section(named, pictures and len(runs) > 1))
+        sections.append(_section(named))
         advance(k + 1)
-    if len(runs) == 1:
-        lead = runs[0].run.report().verdict or _sentence(runs[0].run)
-        player = _player(runs[0]) if pictures else None
-        return Page(_title(runs[0]), lead, (sections[0],), player=player)
-    head = ("run", "path", "seed", "readings", "duration [s]", "distance [m]", "MAE [nT]", "RMS [nT]")
-    note = "MAE and RMS: error of b_measured_nt against the exact field, where that is known."
-    overview = Table("Overview", (*head, "events"), tuple(map(_overview, runs)), note)
+    if together([named.run for named in runs]):
+        first, every = runs[0], [named.run for named in runs]
+        still = path_picture(first.run, first.field, first.planned)
+        data = b"" if still is None else small(still.data)
+        player = player_of(every, first.field, first.stage, still=data)
+        title, verdict, lead = _title(first), first.run.report().verdict, _sentence(first.run)
+        if len(runs) > 1:
+            verdict = _verdict(every)
+            title = f"{len(runs)} robots in {first.run.metadata.get('scene', 'a scene')}"
+            lead = f"{', '.join(str(run.metadata['robot']) for run in every)} drove together."
+        return Page(title, "" if verdict else lead, tuple(sections), player=player, verdict=verdict)
+    overview = replace(OVERVIEW, rows=tuple(map(overview_of, runs)))
     lead = f"{sum(named.run.rows for named in runs):,} readings in all."
     return Page(f"{len(runs)} runs", lead, tuple(sections), overview)
+
+
+def together(runs: Sequence[Run]) -> bool:
+    """Whether runs are those of different robots that drove in one scene at the same time, or only one."""
+    facts = {tuple(run.metadata.get(name) for name in ("scene_sha256", "seed", "lab")) for run in runs}
+    robots = {run.metadata.get("robot") for run in runs} - {None}
+    return len(runs) == 1 or (len(facts) == 1 and len(robots) == len(runs))
+
+
+def _verdict(runs: Sequence[Run]) -> str:
+    """The verdict on the models of several robots; "" without one."""
+    tally = Tally()
+    for run in runs:
+        run.add_to(tally)
+    return tally.verdict(f"the exact field of {len(runs)} robots, one session", holds=HOLDS_ONE)
 
 
 def _title(named: NamedRun) -> str:
@@ -125,7 +152,7 @@ def _sentence(run: Run) -> str:
     return ", ".join(words) + "."
 
 
-def _section(named: NamedRun, pictures: bool) -> Section:
+def _section(named: NamedRun) -> Section:
     run = named.run
     tables = [figures_table(run.report())]
     errors = errors_of(run)
@@ -147,9 +174,8 @@ def _section(named: NamedRun, pictures: bool) -> Section:
     head = ("flag", "meaning", "readings", "times [s]")
     tables.append(Table("Events", head, events, "" if events else "None."))
     tables.append(provenance_table(run.metadata))
-    drawn = path_picture(run, named.field, named.planned) if pictures else None
     lead = f"{named.name}: {_sentence(run)} {named.note}".strip()
-    return Section(_title(named), lead, () if drawn is None else (drawn,), tuple(tables))
+    return Section(_title(named), lead, (), tuple(tables))
 
 
 def page_of_report(
@@ -267,18 +293,8 @@ def provenance_table(metadata: Mapping[str, Any], title: str = "Provenance") -> 
     return Table(title, ("metadata", ""), rows, "" if rows else "No metadata.", exact=True)
 
 
-def _player(named: NamedRun) -> Player:
-    """What plays a run; its charts and map alone if its scene cannot be shown, and why."""
-    still = path_picture(named.run, named.field, named.planned)
-    options: Any = {"still": b"" if still is None else still.data}
-    try:
-        return player_of(named.run, named.field, named.stage, **options)
-    except InputError as error:
-        player = player_of(named.run, named.field, None, **options)
-        return replace(player, note=f"The scene is not shown: {error}. {player.note}".strip())
-
-
-def _overview(named: NamedRun) -> tuple[Any, ...]:
+def overview_of(named: NamedRun) -> tuple[Any, ...]:
+    """The row of a run in `OVERVIEW`."""
     run = named.run
     distance, total = _distance_m(run), errors_of(run).get("total")
     events = sum(int(run[name].any()) for name in run if name.startswith("flag_"))

@@ -27,7 +27,7 @@ from magtwin.figures.canvas import (
     shade,
     zero_line,
 )
-from magtwin.figures.maps import EXTEND, FloorPlan, draw_mean
+from magtwin.figures.maps import EXTEND, FloorPlan, draw_cells, draw_mean, mean_field_nt
 from magtwin.figures.style import (
     DATA,
     FAINT,
@@ -318,6 +318,35 @@ def path_picture(
     over = "the path" if field is None else f"the path over the map {field.name}"
     what = Trail.of(run).name.removesuffix(" [nT]")
     return picture(figure, f"Path driven, coloured by {what}", alt=f"{over}, coloured by {what}", kind=kind)
+
+
+@styled
+def still_of(run: Run | None, field: AnomalyMap | None) -> Picture | None:
+    """A small picture without axes: the path of a run over its map, coloured as by `draw_path`.
+
+    None if neither the map nor a path is known. Without a run, the map alone.
+    """
+    place = None if run is None else position_name(run)
+    known = np.isfinite(run[place][:, :2]).all(axis=1) if run is not None and place else np.zeros(0, bool)
+    p_xy = run[place][known, :2] if run is not None and place else np.empty((0, 2))
+    if field is None and len(p_xy) < 2:
+        return None
+    low, high = np.reshape(field.extent, (2, 2)).T if field else (p_xy.min(axis=0), p_xy.max(axis=0))
+    wide, tall = np.maximum(high - low, 0.1)
+    figure = new_figure(2.0, float(np.clip(2.0 * tall / wide, 0.8, 2.4)))
+    figure.set_layout_engine("none")
+    ax = figure.add_axes((0, 0, 1, 1))
+    if field is not None:
+        mean = mean_field_nt(field)
+        draw_cells(ax, field.x_m, field.y_m, mean, FIELD_COLOURS, clim=colour_limits(mean))
+    if run is not None and len(p_xy) > 1:
+        trail = Trail.of(run)
+        ax.plot(*p_xy[evenly(len(p_xy), 1000)].T, color=INK, lw=3.2)
+        if trail.colours == SIGNED_COLOURS:
+            coloured_line(ax, p_xy, trail.values[known], trail.limits, trail.colours, 2)
+    ax.set_aspect("equal")
+    ax.axis("off")
+    return picture(figure, "The map" if len(p_xy) < 2 else "The path over the map", kind="png")
 
 
 def _title(run: Run, place: str | None) -> str:

@@ -270,15 +270,12 @@ class Scenery:
         scale: ColourScale | None,
     ) -> None:
         """Build the lab, one body per look, and each link of the robot."""
-        placed = [
-            _placed(shape, links[shape.link]) if shape.link else shape.vertices.astype(float)
-            for shape in still
-        ]
-        self._subjects = [v for s, v in zip(still, placed, strict=True) if is_subject(s, scale)]
+        standing = [placed(s.vertices, links[s.link]) if s.link else s.vertices.astype(float) for s in still]
+        self._subjects = [v for s, v in zip(still, standing, strict=True) if is_subject(s, scale)]
         self._screens, self._walls, self._points = add_still(
-            self.plotter, still, placed, scale, baked=not fine
+            self.plotter, still, standing, scale, baked=not fine
         )
-        self._things = inside(still, placed)
+        self._things = inside(still, standing)
         self._actors: dict[str, Any] = {}
         self._links: dict[str, Link] = {}
         for name, link in moving.items():
@@ -287,7 +284,7 @@ class Scenery:
                 continue
             self._actors[name] = self.plotter.add_mesh(joined(meshes), **style_of(False))
             self._links[name] = link
-        self._everything = np.vstack([*placed, self._p]).astype(float)
+        self._everything = np.vstack([*standing, self._p]).astype(float)
 
     def _build_trail(self, run: Run, scale: ColourScale | None) -> None:
         """Build the whole trail, coloured as in a chart; a frame shows the part driven so far."""
@@ -416,8 +413,8 @@ def links_of(links: Mapping[str, Link], robots: Sequence[str], run: Run) -> dict
 
 def sides_of(scene: Scene, run: Run) -> Mapping[str, int]:
     """Columns of `wheel_angle` by the names of the joints of the driven wheels of a run's robot."""
-    placed = scene.led_by(str(run.metadata["robot"])) if scene.others else scene
-    return placed.robot.drive.sides
+    led = scene.led_by(str(run.metadata["robot"])) if scene.others else scene
+    return led.robot.drive.sides
 
 
 def _steps(p_xy: Array) -> NDArray[np.intp]:
@@ -431,10 +428,13 @@ def _steps(p_xy: Array) -> NDArray[np.intp]:
     return np.array(rows, np.intp)
 
 
-def _placed(shape: Shape, link: Link) -> Array:
-    """Vertices of a body that stands still, in world [m]."""
-    T = _matrix(link.p_world_link, link.q_world_link_xyzw)
-    return shape.vertices @ T[:3, :3].T + T[:3, 3]
+def placed(points: ArrayLike, link: Link, *, in_base: bool = False) -> Array:
+    """Points of a link in world, or in the base of its robot at rest [m], shape (N, 3)."""
+    pose = (
+        (link.p_base_link, link.q_base_link_xyzw) if in_base else (link.p_world_link, link.q_world_link_xyzw)
+    )
+    T = _matrix(*pose)
+    return np.asarray(points) @ T[:3, :3].T + T[:3, 3]
 
 
 def _matrix(p: ArrayLike, q_xyzw: ArrayLike) -> Array:

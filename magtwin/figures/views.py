@@ -1,9 +1,8 @@
-"""Views of files: show, draw or film a run or a stage; a page about runs; two runs compared."""
+"""Views of files: show, draw or film a run or a stage; two runs compared."""
 
 import tempfile
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,19 +15,14 @@ from magtwin.figures.reports import (
     draw_comparison,
     page_of_comparison,
     page_of_maps,
-    page_of_runs,
 )
 from magtwin.files.file import existing
 from magtwin.files.outputs import check_free
 from magtwin.io.convert import twin_to_show
 from magtwin.io.formats import read_run
-from magtwin.io.provenance import map_of, planned_of
 from magtwin.run.compare import Comparison, compare
 from magtwin.run.run import Run
 from magtwin.usd.layers import stage_sha256
-
-MOST_PICTURED = 60
-"""Largest number of runs with pictures on a page; each takes 0.4 MB and a second."""
 
 STAGES = (".usd", ".usda", ".usdc", ".usdz")
 
@@ -107,52 +101,6 @@ def film(
     file, out = existing(file, "run"), check_free(out, force=force)
     run, stage = _run_and_scene(file, scene)
     film_of_run(run, stage, out, speed=pace, force=force, **options)
-
-
-def report_runs(
-    runs: Sequence[Source],
-    out: Source,
-    *,
-    scene: Source | None = None,
-    force: bool = False,
-    progress: Callable[[int, int, str], None] = lambda done, total, what: None,
-) -> None:
-    """Write a page about runs: what was run, map and path, time series, errors, events, provenance.
-
-    Args:
-        runs: Runs in any format; a folder that `magtwin sweep` made stands for its runs.
-        out: Page to write (.html).
-        scene: Scene of the map below the paths. None: the one of each run's metadata.
-        force: Whether an existing page is replaced.
-        progress: Called with the number of runs done, the number in all and the current step.
-
-    Raises:
-        InputError: A run or `scene` cannot be read, or the page cannot be written.
-    """
-    from magtwin.files.kinds import scene_file
-    from magtwin.twin import scene_of
-
-    out = check_free(out, force=force)
-    scene = None if scene is None else scene_file(scene)
-    files = [file for source in runs for file in runs_in(Path(source))]
-    names = [file.name for file in files]
-    named = []
-    for k, file in enumerate(files):
-        progress(k, len(files), f"reading {file.name}")
-        run, note, field, stage = read_run(file), "", None, None
-        try:
-            field, stage = map_of(run, scene, near=file), scene_of(run, scene, near=file)
-        except InputError as error:
-            note = f"Its map is not shown: {error}."
-            if scene is not None:
-                warnings.warn(f"{file}: its map is not shown: {error}", MismatchWarning, stacklevel=2)
-        name = file.name if names.count(file.name) == 1 else str(file)
-        named.append(NamedRun(name, run, field, planned_of(run, near=file), note, stage))
-    pictured = len(named) <= MOST_PICTURED
-    page = page_of_runs(named, pictures=pictured, advance=lambda done: progress(done, len(named), "drawing"))
-    if not pictured:
-        page = replace(page, lead=f"{page.lead} Pages of more than {MOST_PICTURED} runs have no pictures.")
-    write_page(page, out, force=force)
 
 
 def compare_files(
@@ -240,13 +188,6 @@ def floor_plan(source: Source) -> FloorPlan | None:
 def names_of(a: Path, b: Path) -> tuple[str, str]:
     """Names of two files that tell them apart."""
     return (a.name, b.name) if a.name != b.name else (str(a), str(b))
-
-
-def runs_in(path: Path) -> list[Path]:
-    """The runs in a folder that `magtwin sweep` made, or the one run that a path names."""
-    if not (path / "runs.csv").is_file():
-        return [path]
-    return sorted(path.glob("run_*.parquet"))
 
 
 def _run_and_scene(file: Path, scene: Source | None) -> tuple[Run, Path]:

@@ -416,6 +416,21 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         """
         return importlib.import_module("magtwin").plot(self, anomaly_map=anomaly_map)  # loads io when called
 
+    def view(self, scene: "str | os.PathLike[str] | None" = None, *, height: int = 800) -> Any:
+        """The run in its lab in 3D, with charts, in a notebook: the page of `magtwin report`.
+
+        Args:
+            scene: Scene of the run. None: the one of its metadata; without it, charts and map are shown.
+            height: Height of the frame [pixels].
+
+        Returns:
+            What a notebook shows, at most about 1 MB. `page` is its HTML.
+
+        Raises:
+            InputError: The run has no rows or no clock, or `scene` cannot be read.
+        """
+        return importlib.import_module("magtwin.figures.reporting").embedded(self, scene, height)
+
     def save(self, path: "str | os.PathLike[str]", **options: Any) -> None:
         """Write the run to a file in the format of its suffix; `magtwin.load_run` gives it back.
 

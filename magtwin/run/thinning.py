@@ -1,5 +1,7 @@
 """Thinning: rows of a recording at a lower rate, without losing readings to dropouts."""
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,3 +25,14 @@ def newest(ends: Rows, good: NDArray[np.bool_]) -> Rows:
     latest = np.maximum.accumulate(np.where(good, np.arange(len(good)), -1))[ends]
     begins = np.concatenate([[0], ends[:-1] + 1])
     return np.where(latest >= begins, latest, ends)
+
+
+def rows_shown(run: Run, most: int) -> Rows:
+    """At most about `most` rows to draw: all, or of each stretch the first and that with the largest step."""
+    if run.rows <= most:
+        return np.arange(run.rows)
+    name = next((name for name in ("b_measured_nt", "b_total_nt", "t") if name in run), "t")
+    step = np.abs(np.convolve(np.nan_to_num(run[name]), [-0.5, 1, -0.5], "same"))
+    edges = np.linspace(0, run.rows, most // 2 + 1).astype(int)
+    worst = [a + int(np.argmax(step[a:b])) for a, b in pairwise(edges)]
+    return np.unique([*edges[:-1], *worst, run.rows - 1])

@@ -8,7 +8,8 @@ import pytest
 from magtwin import load_run
 from magtwin.cli import main
 from magtwin.errors import InputError
-from magtwin.figures.views import film, report_runs
+from magtwin.figures.reporting import report_runs
+from magtwin.figures.views import film
 from magtwin.files.kinds import scene_file, shipped_or
 from magtwin.io.convert import convert_run
 from magtwin.io.formats import runs_in

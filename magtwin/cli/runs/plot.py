@@ -37,8 +37,8 @@ def plot(
         A run in any format that magtwin reads, a stage, a map (layer, or folder of survey CSVs), or the name
         of a scene that ships with magtwin: lab. Two runs or two maps are compared.
     out
-        Picture (.png, .jpg; .svg of charts and maps), page (.html of maps) or film (.mp4, .gif) to write. Default: a .png named
-        after the file.
+        Picture (.png, .jpg; .svg of charts and maps), page (.html of maps) or film (.mp4, .gif) to write.
+        Default: a .png named after the file.
     show
         Of a run: charts, or a picture of its end. Of a map, or a stage's map, by heading: the field, its
         gradient along the floor, its standard deviation (variance), the masked nodes (mask), or each heading

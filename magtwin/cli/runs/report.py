@@ -17,25 +17,26 @@ if TYPE_CHECKING:
 @app.command
 def report(
     *runs: Annotated[Path, Parameter(required=True)],
-    out: Path = Path("report.html"),
+    out: Path | None = None,
     scene: RunScene = None,
     force: Force = False,
 ) -> Done:
-    """Write one page about a run or a set of runs, with its pictures inside.
+    """Write a page that plays a run in its lab, with charts, errors by source, events and provenance.
 
-    It has what was run, the map with the path, time series, errors by source, events and provenance. Several
-    runs get an overview first.
+    Runs of robots that drove together in one scene are played together. Other sets of runs get an overview
+    with a small picture of each.
 
     Parameters
     ----------
     runs
         Runs in any format that magtwin reads; a folder that `magtwin sweep` made stands for all of its runs.
     out
-        Page to write (.html); it needs no other file.
+        Page to write (.html), which needs no other file; or a folder, with index.html and a page of each run.
+        Default: report.html; for the folder of a sweep, the folder report.
     """
-    from magtwin.figures.views import report_runs
+    from magtwin.figures.reporting import report_runs, usual_name
 
-    out = named(out, (".html",), "a report", force=force)
+    out = named(out or usual_name(runs), (".html", ""), "a report", force=force)
     with progress("Reporting", "runs") as advance:
         report_runs(runs, out, scene=scene, force=force, progress=advance)
     return Done(wrote=out, text="open it in a browser")

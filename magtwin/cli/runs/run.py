@@ -50,7 +50,7 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False) -> D
     from magtwin.author.robot import build_robot
     from magtwin.author.scene import author_scene
     from magtwin.figures.pictures import picture_of_stage
-    from magtwin.figures.views import report_runs
+    from magtwin.figures.reporting import report_runs
     from magtwin.files.file import shipped
     from magtwin.files.outputs import free, output
     from magtwin.io.outputs import Outputs, drive

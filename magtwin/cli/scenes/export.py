@@ -27,8 +27,8 @@ def export(
     scene
         A scene or any other stage (.usd, .usda, .usdc, .usdz), or the name of a shipped one: lab.
     out
-        What to make: a folder, a package (.usdz), one layer (.usd, .usdc), a .glb for the web, or a world of
-        Gazebo (.sdf).
+        What to make: a folder, a package (.usdz), one layer (.usd, .usdc), a .glb for the web, a page that
+        shows lab, map and run in a browser (.html), or a world of Gazebo (.sdf).
     target
         Program to export for: omniverse; isaac, with an Action Graph for ROS 2; newton; viewer, one layer for
         simple viewers; or gazebo, the lab without robots. Default: omniverse for folders and packages, gazebo
@@ -46,6 +46,16 @@ def export(
     from magtwin.files.outputs import free
 
     stage = scene_file(scene)
+    if out.suffix.lower() == ".html":
+        from magtwin.figures.reporting import report_runs, report_scene
+
+        if target is not None:
+            raise InputError("a page is for browsers; leave out --target")
+        (out,) = free(out, force=force)
+        if run is None:
+            return Done(wrote=report_scene(stage, out, force=force))
+        report_runs([existing(run, "run")], out, scene=stage, force=force)
+        return Done(wrote=out)
     (out,) = free(out, beside=("_magtwin",) if out.suffix.lower() == ".usdz" else (), force=force)
     if target == "gazebo" or (target is None and out.suffix.lower() == ".sdf"):
         from magtwin.export.gazebo import export_world

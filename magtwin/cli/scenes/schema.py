@@ -23,6 +23,7 @@ def schema(*, out: Path | None = None, toml: Path | None = None, force: Force = 
         line `#:schema ./scene.schema.json` is completed and checked by editors that know TOML schemas.
     """
     from magtwin.files.outputs import free
+
     if toml is not None:
         from magtwin.files.settings import copy_schemas
 

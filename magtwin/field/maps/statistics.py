@@ -160,3 +160,28 @@ def colour_limits(values: ArrayLike, outer_percent: float = OUTER_PERCENT) -> tu
         return 0.0, 1.0
     low, high = np.percentile(known, (outer_percent, 100 - outer_percent))
     return float(low), float(high)
+
+
+def heading_harmonics(field: AnomalyMap, most: int, enough_nt: float) -> tuple[NDArray[np.float64], float]:
+    """A map as harmonics of the heading, B = c0 + sum_k ck cos(k h) + sk sin(k h), by least squares.
+
+    Args:
+        field: The map.
+        most: Most harmonics, K.
+        enough_nt: RMS error that needs no more [nT].
+
+    Returns:
+        The coefficients c0, c1, s1, ... [nT], shape (1 + 2 K, Y, X), 0 at nodes that some heading lacks; and
+        the RMS error at the others [nT].
+    """
+    known, turns = field.valid.all(axis=0), field.headings_rad
+    values, rms = np.where(known, field.values_nt, 0.0), 0.0
+    for order in range(most + 1):
+        waves = [f(k * turns) for k in range(order + 1) for f in ((np.cos, np.sin) if k else (np.cos,))]
+        basis = np.stack(waves, axis=1)
+        parts = np.tensordot(np.linalg.pinv(basis), values, 1)
+        if known.any():
+            rms = float(np.sqrt(np.mean((np.tensordot(basis, parts, 1) - values)[:, known] ** 2)))
+        if rms < enough_nt or 2 * order + 1 >= len(turns):
+            break
+    return parts, rms
