@@ -126,7 +126,7 @@ def _free_floor(free: NDArray[np.bool_], step: float) -> tuple[Any, float]:
     for j, row in enumerate(part):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], row.view(np.int8), [0]]))).reshape(-1, 2)
         runs += [np.array([[a, j], [b, j], [b, j + 1], [a, j + 1]], float) for a, b in edges]
-    shape = section(runs).simplify(1.0)
+    shape = section(runs).simplify(1.5)
     rough = [np.asarray(p) * step for p in shape.to_polygons()]
     kept = [p for p in rough if area(p) > 0 or np.ptp(p, axis=0).max() > SPECK_M]
     from manifold3d import CrossSection, FillRule
