@@ -109,8 +109,8 @@ If more than 20 % of the free floor is then outside of the path, the run's summa
 command say how much; the metadata keep it as `path_swept`.
 
 **`coverage`** is planned for the room: strips 0.5 m apart over all of the floor that the robot can reach,
-through every open door. Its `path_swept` is the share of that floor within 0.25 m of the path. A warning names
-each part of the floor that it cannot enter, and the nearest door.
+through every open door. Its `path_swept` is the share of that floor within 0.25 m of the path. A warning
+names each part of the floor that it cannot enter, and the nearest door.
 
 **A CSV file** is driven unchanged. If it does not fit, the error message proposes a change. `--fit` moves
 the path and, if necessary, shrinks it.
@@ -128,12 +128,13 @@ wall = [{from = [4, 0], to = [4, 3], material = "reinforced_concrete"}, {from = 
 door = [{wall = 0, at_m = 1.2, material = "steel"}, {wall = 1, at_m = 2}]
 ```
 
-* **Sides.** The low walls of `[lab]` stand around the floor. Doors and windows can be in them too: of a floor
-  with corners they are called `edge_0`, `edge_1` and so on, of a rectangle `south`, `east`, `north` and `west`.
-* **Doors** have a leaf that turns about its hinge. An open one is driven through; a closed one is an obstacle.
-  On the stage, turn the prim of the door to open it.
-* **Field.** Walls of steel or reinforced concrete and doors of steel are magnetised as furniture is. Their field
-  is exact, and a map is stale once a steel door turns.
+* **Sides.** The low walls of `[lab]` stand around the floor. Doors and windows can be in them too: of a
+  floor with corners they are called `edge_0`, `edge_1` and so on, of a rectangle `south`, `east`, `north` and
+  `west`.
+* **Doors** have a leaf that turns about its hinge. An open one is driven through; a closed one is an
+  obstacle. On the stage, turn the prim of the door to open it.
+* **Field.** Walls of steel or reinforced concrete and doors of steel are magnetised as furniture is. Their
+  field is exact, and a map is stale once a steel door turns.
 * **Start.** Without `start`, the robot stands at the first point of its path.
 
 ## A room from a floor plan
@@ -145,17 +146,18 @@ magtwin new room.toml --plan map.pgm
 
 | plan | what is read | scale |
 |---|---|---|
-| .svg | lines, polylines, polygons, rectangles, paths; transforms; curves are straight | width in mm, cm, in or m |
+| .svg | lines, polylines, polygons, rectangles, paths; curves are straight | width in mm, cm, in or m |
 | .dxf | LINE, LWPOLYLINE, POLYLINE, INSERT; ARC as the swing of a door; text form only | `$INSUNITS` |
 | .geojson | lines and polygons; degrees are projected to the plane in their middle | metres or degrees |
 | .pgm, .png, .yaml | the largest free part of an occupancy map of ROS, in the map's axes | `resolution` |
 
-* **Layers**, groups, classes and properties say what a line is: door, window, or what is left out (furniture,
-  text, dimensions). All other lines are walls, 0.1 m thick unless their stroke has a width. A rectangle thinner
-  than 0.6 m is one wall.
+* **Layers**, groups, classes and properties say what a line is: door, window, or what is left out
+  (furniture, text, dimensions). All other lines are walls, 0.1 m thick unless their stroke has a width. A
+  rectangle thinner than 0.6 m is one wall.
 * **Doors and windows** are lines across their opening, in a wall or in a gap between walls.
 * **Floor**: the closed line around all others, or else what the walls enclose, across gaps up to 1.3 m.
-* **Scale.** `--scale` is metres per unit of the drawing. A plan without one is refused with its size in units.
+* **Scale.** `--scale` is metres per unit of the drawing. A plan without one is refused, with its size in
+  units.
 
 ## A lab in another place
 

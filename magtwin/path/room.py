@@ -371,11 +371,10 @@ class _Free:
 
     def inside(self, room: Room, clear_m: float) -> NDArray[np.bool_]:
         """The free places at which the robot is on the floor, and `clear_m` from its border."""
-        nodes = [
-            self._low[k] + self.step_m * np.arange(n) - room.middle_m[k]
-            for k, n in enumerate(self.free.shape)
-        ]
-        near = [np.abs(nodes[k]) <= room.reach_m[k] - clear_m for k in (0, 1)]
+        near = []
+        for k, count in enumerate(self.free.shape):
+            nodes = self._low[k] - room.middle_m[k] + self.step_m * np.arange(count)
+            near.append(np.abs(nodes) <= room.reach_m[k] - clear_m)
         return np.asarray(self.free & near[0][:, None] & near[1])
 
     def places(self, cells: ArrayLike) -> Array:

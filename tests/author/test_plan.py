@@ -8,13 +8,16 @@ import pytest
 from magtwin.author.plan.plan import plan_toml
 from magtwin.author.plan.svg import read_svg
 from magtwin.author.room import obstacles_in
+from magtwin.author.scene_file import SceneFile
+from magtwin.author.walls import lab_with_walls
 from magtwin.cli import main
 from magtwin.errors import InputError
+from magtwin.files.settings import from_table, read_toml
 from magtwin.path import Room, path_in
 from magtwin.path.occupancy import occupancy_of
 from magtwin.spec.lab import LabSpec, area_m2, on_polygon
 from magtwin.spec.walls import Door, Wall
-from magtwin.twin import new_scene, scene_from_toml
+from magtwin.twin import new_scene
 
 SVG = """<?xml version="1.0"?>
 <svg xmlns="http://www.w3.org/2000/svg" xmlns:inkscape="http://www.inkscape.org/namespaces/inkscape" {size}>
@@ -68,7 +71,14 @@ def geojson(place) -> str:
 def room_in(tmp_path, name: str, text: str, scale: float | None = None) -> LabSpec:
     (tmp_path / name).write_text(text, encoding="utf-8")
     toml = new_scene(tmp_path / "room.toml", plan=tmp_path / name, scale=scale)
-    return scene_from_toml(toml, map_layer=None).lab
+    return lab_of(toml)
+
+
+def lab_of(toml) -> LabSpec:
+    """The room of a TOML, which is not surveyed."""
+    table = read_toml(toml)
+    given = from_table(SceneFile, {**table, "robot": [table["robot"]]}, toml)
+    return lab_with_walls(given.lab, given.wall, given.door, given.window, toml, seed=0)
 
 
 def covered(lab: LabSpec) -> float:
@@ -154,7 +164,7 @@ def test_an_occupancy_map_becomes_the_room_that_it_shows(tmp_path, yaw):
     grid = occupancy_of(Room(made.floor_m, 0.171, obstacles_in(made, ()), made.corners))
     file, _ = grid.save(tmp_path / "map.yaml")
     file.write_text(file.read_text(encoding="utf-8").replace("0.0]", f"{yaw}]"), encoding="utf-8")
-    lab = scene_from_toml(new_scene(tmp_path / "room.toml", plan=tmp_path / "map.pgm")).lab
+    lab = lab_of(new_scene(tmp_path / "room.toml", plan=tmp_path / "map.pgm"))
     assert area_m2(lab.corners) == pytest.approx(36 - 0.3, rel=0.03)
     inside = np.array([[1.0, 1.0], [7.0, 1.0], [1.0, 5.0], [2.0, 3.0]])
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
@@ -179,7 +189,7 @@ BOX = '<svg width="90" height="50"><rect id="wall" width="90" height="50" stroke
             "p.svg",
             BOX.replace('"90"', '"90mm"', 1),
             None,
-            r"would be 0.09 x 0.05 m large, since its width is 90mm; give `scale",
+            r"would be 0.02381 x 0.01323 m large, since its width is 90mm; give `scale",
         ),
         ("p.svg", BOX, 100.0, "would be 9000 x 5000 m large, since scale is 100"),
         ("p.svg", BOX, -1.0, "scale must be above 0"),

@@ -107,8 +107,8 @@ def test_every_key_of_walls_doors_and_windows_goes_into_the_stage_and_back(tmp_p
 
 def test_the_field_of_walls_and_doors_is_magpylibs(l_room):
     lab, rng = l_room[0].lab, np.random.default_rng(1)
-    tall = replace(lab.walls[0], magnetization=40.0, susceptibility=0.0)
-    lab = replace(lab, walls=(tall, lab.walls[1]), doors=(replace(lab.doors[0], open_deg=63.0), lab.doors[1]))
+    tall, leaf = replace(lab.walls[0], magnetization=20.0), replace(lab.doors[0], magnetization=100.0)
+    lab = replace(lab, walls=(tall, lab.walls[1]), doors=(replace(leaf, open_deg=63.0), lab.doors[1]))
     steel = lab.magnets
     assert len(steel) == 4  # two solids and a lintel of the wall, and the leaf
     beside = [
@@ -128,7 +128,7 @@ def test_the_field_of_walls_and_doors_is_magpylibs(l_room):
         for source in steel
     )
     got = Bodies([body_of(source) for source in steel]).field_nt(p)
-    assert np.abs(got - want * 1e9).max() < 0.01
+    assert np.abs(got - want * 1e9).max() < 0.01  # dipoles replace far bodies, within 1e-5 of these fields
     assert np.linalg.norm(got, axis=1).max() > 1000
 
 
@@ -145,7 +145,7 @@ def test_a_leaf_turns_about_its_hinge_and_to_the_side_of_its_sign(open_deg, hing
     middle = box.ComputeCentroid()
     jamb = -0.45 if hinge == "start" else 0.45
     assert np.hypot(middle[0] - jamb, middle[1]) == pytest.approx(0.45, abs=0.06)
-    assert np.sign(round(middle[1], 1)) == np.sign(round(np.sin(np.radians(open_deg)), 9))
+    assert open_deg == 0 or np.sign(middle[1]) == np.sign(open_deg)
     assert read_lab(stage.GetPrimAtPath("/World/Lab")) == lab
 
 
@@ -289,7 +289,7 @@ DOOR = '[[door]]\nwall = "a"\nat_m = 2\n'
         ),
         ("floor = [[0, 0], [4, 0], [4, 4]]\nfloor_m = [4, 4]", "", "floor", "floor_m .* left out"),
         ("floor = [[0, 0], [9000, 0], [9000, 5000]]", "", "floor", "metres"),
-        ("", "[[wall]]\nfrom = [1, 1]\nto = [1, 1]\n", "to", "end of WallTable must differ"),
+        ("", "[[wall]]\nfrom = [1, 1]\nto = [1, 1]\n", "from", "end of WallTable must differ"),
         ("", WALL + "material = 'steal'\n", "material", "'steal'.*steel"),
         ("", WALL + "magnetization = 3.0\n", "magnetization", "plasterboard is not magnetic"),
         ("", WALL + WALL, "name", "'a' has a name that is taken"),
@@ -322,6 +322,7 @@ DOOR = '[[door]]\nwall = "a"\nat_m = 2\n'
 def test_walls_that_cannot_be_are_refused_with_line_place_and_the_way_on(tmp_path, lab, more, line, said):
     text = (
         L_ROOM.split("lab = ")[0].replace("robot =", "start = [-2.0, -1.0, 0.0]\nrobot =")
+        + L_ROOM[L_ROOM.index("earth") : L_ROOM.index("survey")]
         + f"[lab]\n{lab}\n{more}"
     )
     file = written(tmp_path, text.replace("start", "# start") if lab else text)

@@ -200,15 +200,16 @@ def _open(plan: Plan, lines: list[Line], kind: str, sides: tuple[Wall, ...]) -> 
         spans = [bar[0]] if bar else spans
         if not line.arc and any(np.hypot(*(line.p - hinge).T).min() < NEAR_M for hinge in hinges):
             continue  # the leaf of a door, which its swing has placed
-        placed = [where for span in spans if (where := _place(plan, span, (*plan.walls[:begun], *sides)))]
+        placed = [where for span in spans if (where := _place(span, (*plan.walls[:begun], *sides)))]
         if not placed:
             lost += 1
             continue
-        wall, first, last = min(placed, key=lambda where: where[0] is None)
+        wall, ends = min(placed, key=lambda where: where[0] is None)
         if wall is None:
-            wall = _wall(len(plan.walls), np.array([first, last]), THICK_M)
+            wall = _wall(len(plan.walls), ends, THICK_M)
             plan.walls.append(wall)
-            first, last = THICK_M / 2, wall.length_m - THICK_M / 2  # clear of the walls that meet here
+            ends = np.array([THICK_M / 2, wall.length_m - THICK_M / 2])  # clear of the walls that meet here
+        first, last = map(float, ends)
         middle, width = round((first + last) / 2, 3), math.floor((last - first) * 1000 - 1) / 1000
         same = [each for each in plan.openings if each.wall == wall.name]
         if all(abs(each.at_m - middle) > (each.width_m + width) / 2 for each in same):
@@ -219,7 +220,7 @@ def _open(plan: Plan, lines: list[Line], kind: str, sides: tuple[Wall, ...]) -> 
         plan.notes.append(f"{lost} lines of {kind}s left out: in no wall and in no gap between walls")
 
 
-def _place(plan: Plan, span: Array, walls: tuple[Wall, ...]) -> tuple[Wall | None, object, object] | None:
+def _place(span: Array, walls: tuple[Wall, ...]) -> tuple[Wall | None, Array] | None:
     """The wall that an opening is in, with its begin and end there; no wall, with its ends, for a gap."""
     if not DOORS_M[0] <= math.dist(*span) <= DOORS_M[1]:
         return None
@@ -232,10 +233,10 @@ def _place(plan: Plan, span: Array, walls: tuple[Wall, ...]) -> tuple[Wall | Non
             and first >= -NEAR_M
             and last <= wall.length_m + NEAR_M
         ):
-            return wall, max(first, 0.0), min(last, wall.length_m)
+            return wall, np.clip([first, last], 0.0, wall.length_m)
     ends = np.array([end for wall in walls for end in (wall.start, wall.end)]).reshape(-1, 2)
     if len(ends) and all(np.hypot(*(ends - p).T).min() < 2 * NEAR_M for p in span):
-        return None, span[0], span[1]
+        return None, span
     return None
 
 

@@ -155,11 +155,8 @@ def _transform(text: str, where: str) -> Array:
                 turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
                 step = _moved(n[1], n[2]) @ turn @ _moved(-n[1], -n[2]) if len(n) > 2 else turn
             else:
-                bend = math.tan(math.radians(n[0]))
-                step = (
-                    np.eye(3)
-                    + bend * np.eye(3)[[{"skewX": 0, "skewY": 1}[name]]].T @ np.eye(3)[[name == "skewX"]]
-                )
+                step = np.eye(3)
+                step[{"skewX": (0, 1), "skewY": (1, 0)}[name]] = math.tan(math.radians(n[0]))
         except (IndexError, KeyError) as error:
             raise InputError(
                 f"{where}: transform {name}({inside})"[:120] + " is none of SVG; correct it"
