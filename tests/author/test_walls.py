@@ -79,7 +79,7 @@ def l_room(tmp_path_factory):
 
 
 def lab_room(lab: LabSpec, radius: float = 0.171) -> Room:
-    return Room(lab.floor_m, radius, obstacles_in(lab, ()), lab.corners if lab.floor else ())
+    return Room(lab.floor_m, radius, obstacles_in(lab, ()), lab.border)
 
 
 def test_a_stage_of_walls_reads_back_as_its_toml_and_is_valid(l_room):
