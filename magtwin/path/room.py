@@ -365,15 +365,14 @@ class _Free:
         # A point is at most this far from the nearest node of the raster.
         needed = room.footprint_radius_m + clear_m + self.step_m / math.sqrt(2)
         distance, _ = standing.clearance(at.reshape(-1, 2), reach_m=needed)
-        self.free = (distance >= needed).reshape(at.shape[:2])
+        self.free: NDArray[np.bool_] = (distance >= needed).reshape(at.shape[:2])
         if room.corners:
             self.free &= on_polygon(at.reshape(-1, 2), room.corners).reshape(at.shape[:2])
 
     def inside(self, room: Room, clear_m: float) -> NDArray[np.bool_]:
         """The free places at which the robot is on the floor, and `clear_m` from its border."""
         near = list[NDArray[np.bool_]]()
-        for k in (0, 1):
-            count = self.free.shape[k]
+        for k, count in enumerate(self.free.shape):
             nodes = self._low[k] - room.middle_m[k] + self.step_m * np.arange(count)
             near.append(np.abs(nodes) <= room.reach_m[k] - clear_m)
         return np.asarray(self.free & near[0][:, None] & near[1])
