@@ -6,7 +6,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, Vt
 from magtwin.frames import quat_from_rpy
 from magtwin.spec.lab import LabSpec
 from magtwin.usd.attributes import write_pose, write_spec
-from magtwin.usd.lab.looks import define_box, define_looks, define_visual, hide, wear
+from magtwin.usd.lab.looks import SHAPES, define_box, define_looks, define_shapes, define_visual, hide
 from magtwin.usd.lab.walls import define_walls
 from magtwin.usd.lab.walls import read_lab as read_lab
 from magtwin.usd.layers import WORLD
@@ -65,7 +65,9 @@ def define_lab(stage: Usd.Stage, spec: LabSpec) -> Usd.Prim:
     edge = spec.wall_thickness_m + spec.apron_m  # walls and posts stand on the slab too
     size, middle = (x1 - x0 + 2 * edge, y1 - y0 + 2 * edge), ((x0 + x1) / 2, (y0 + y1) / 2)
     if spec.floor:
-        _define_slab(stage, spec, edge)
+        define_shapes(stage)
+        define_floor_shape(stage, spec)
+        define_visual(stage, LAB.AppendChild("Floor"), "floor", (0, 0, 0), (1, 1, 1), FLOOR)
     else:
         centre = (0, 0, -FLOOR_THICKNESS_M / 2)
         define_box(stage, LAB.AppendChild("Floor"), centre, (*size, FLOOR_THICKNESS_M), FLOOR)
@@ -89,15 +91,18 @@ def expose_for_kit(layer: Sdf.Layer) -> None:
     layer.customLayerData = {**layer.customLayerData, "renderSettings": settings}
 
 
-def _define_slab(stage: Usd.Stage, spec: LabSpec, edge: float) -> None:
-    """The slab of a floor with corners, `edge` wider all around [m]."""
+def define_floor_shape(stage: Usd.Stage, spec: LabSpec) -> None:
+    """Author the slab of a floor with corners as a class prim, like the unit shapes of `SHAPES`."""
+    path = SHAPES.AppendChild("floor")
+    if not spec.floor or stage.GetPrimAtPath(path):
+        return
     from manifold3d import CrossSection, FillRule, JoinType, Manifold  # takes 0.05 s
 
+    edge = spec.wall_thickness_m + spec.apron_m
     outline = CrossSection([np.array(spec.corners)], FillRule.Positive).offset(edge, JoinType.Miter, 2.0)
     made = Manifold.extrude(outline, FLOOR_THICKNESS_M).translate((0, 0, -FLOOR_THICKNESS_M)).to_mesh()
-    mesh = UsdGeom.Mesh.Define(stage, LAB.AppendChild("Floor"))
-    define_triangles(mesh, np.asarray(made.vert_properties)[:, :3], made.tri_verts, shaded=True)
-    wear(mesh, FLOOR)
+    points = np.asarray(made.vert_properties)[:, :3]
+    define_triangles(UsdGeom.Mesh.Define(stage, path), points, made.tri_verts, shaded=True)
 
 
 def _define_ground(
