@@ -214,10 +214,11 @@ def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> 
     touched = np.flatnonzero(distance < footprint_radius_m - 1e-9)
     if len(touched):
         i = int(touched[0])
+        door = "open the door (open_deg), " if obstacles.names[which[i]].endswith("/leaf") else ""
         raise InputError(
             f"path {path.name} runs into {obstacles.names[which[i]]}: {s[i]:.3f} m along it, at "
             f"({p[i, 0]:.3f}, {p[i, 1]:.3f}) m, a robot of radius {footprint_radius_m:g} m is "
-            f"{footprint_radius_m - distance[i]:.3f} m too near; give `fit=True`, or move the path or the "
+            f"{footprint_radius_m - distance[i]:.3f} m too near; {door}give `fit=True`, or move the path or the "
             "obstacle"
         )
 
