@@ -24,7 +24,7 @@ from magtwin.usd.attributes import check_prim_name, write_pose
 from magtwin.usd.lab.earth import define_earth
 from magtwin.usd.lab.furniture import FURNITURE, define_furniture
 from magtwin.usd.lab.looks import SHAPES, SHAPES_FILE, VISUALS, define_shapes
-from magtwin.usd.lab.room import LAB, PHYSICS_SCENE, define_lab, expose_for_kit
+from magtwin.usd.lab.room import LAB, PHYSICS_SCENE, define_floor_shape, define_lab, expose_for_kit
 from magtwin.usd.lab.sources import LOOKS, SOURCES, define_sources
 from magtwin.usd.layers import WORLD, describe_stage, new_stage, relative_asset
 from magtwin.usd.maps.attributes import read_made_from, write_made_from
@@ -245,6 +245,7 @@ def _write_parts(scene: Scene, folder: Path) -> list[Path]:
     shapes = folder / SHAPES_FILE
     with new_stage(shapes, "Unit shapes of what is shown, by magtwin") as stage:
         define_shapes(stage)
+        define_floor_shape(stage, scene.lab)
     paths = []
     for name, content, about, define in parts:
         if content:  # the root layer may have the name

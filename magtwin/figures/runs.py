@@ -45,6 +45,7 @@ from magtwin.run import mapped
 from magtwin.run.compare import FIELDS, POSITIONS
 from magtwin.run.figures import prediction_nt
 from magtwin.run.run import Run
+from magtwin.run.summary import swept
 
 MOST_OTHER = 4
 """Columns drawn of a run that has none of the usual ones."""
@@ -356,4 +357,6 @@ def _title(run: Run, place: str | None) -> str:
     if place is not None:
         steps = np.diff(run[place][np.isfinite(run[place][:, :2]).all(axis=1), :2], axis=0)
         size.append(f"{np.linalg.norm(steps, axis=1).sum():.1f} m")
+    floor = swept(run.metadata).partition(",")[0]
+    size += [floor] if floor else []
     return f"{', '.join(names) or 'run'}: {', '.join(size)}"

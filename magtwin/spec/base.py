@@ -23,6 +23,9 @@ UNIT_TOLERANCE = 1e-6
 """Largest error of the squared length of a unit quaternion; single precision passes."""
 
 
+KEY = "key"
+"""Metadata of a field: its key in a TOML, if that is not its name; None if a TOML does not have it."""
+
 LATER = "later"
 """Metadata of a field that a later version added: `spelled` leaves it out while it has its default."""
 
