@@ -21,6 +21,7 @@ from magtwin.spec.scene import Scene
 from magtwin.twin.twin import (
     Kind,
     Metadata,
+    Network,
     Twin,
     scene_sha256,
     without_tracking_error,
@@ -39,7 +40,7 @@ def open_twin(
     *,
     lab: str = "",
     map_layer: str | FilePath | None = None,
-    network: str | FilePath | None = None,
+    network: Network = None,
     magnetometer: Kind | None = None,
     model_error: bool = True,
     tracking_error: bool = True,
@@ -59,8 +60,8 @@ def open_twin(
         lab: Path of the lab's root prim on a stage of several labs. Default: the only lab.
         map_layer: Map that replaces the scene's, such as one of the same room on another day. What shows the
             stage still shows the stage's own map.
-        network: Weights (.safetensors or .pth) that replace those of the scene; or "none" for a physical
-            magnetometer.
+        network: Weights (.safetensors or .pth) that replace those of the scene; a predictor, or what
+            `magtwin.train` gives; or "none" for a physical magnetometer.
         magnetometer: Kind that replaces the scene's: "physical", "neural" or "map-only".
         model_error: Whether a random model error is added to the readings of a neural magnetometer, as large
             as the network's error on recordings outside its training set; see
@@ -72,6 +73,7 @@ def open_twin(
     Raises:
         InputError: The stage, its map or its weights are missing or broken, or a checksum does not match.
     """
+    network = _weights_file(network)
     options: Any = {"network": network, "magnetometer": magnetometer, "model_error": model_error}
     options["tracking_error"] = tracking_error
     if isinstance(scene, Scene):
@@ -148,6 +150,20 @@ def geometry(twin: Twin) -> "tuple[list[Shape], dict[str, Link]]":
         return alone.shapes, alone.links
     stage = open_alone(twin.scene_file, name, lab=str(twin.metadata.get("lab", "")))
     return list(read_shapes(stage)), read_links(stage)
+
+
+def _weights_file(network: Network) -> str | FilePath | None:
+    """The file of a network; one that is in memory is written to a temporary folder."""
+    predictor: Any = getattr(network, "predictor", network)
+    if predictor is None or isinstance(predictor, str | FilePath):
+        return predictor
+    if not hasattr(predictor, "residual_sd_nt"):
+        kind = type(network).__name__
+        raise InputError(f"network must be a weights file or a predictor, got {kind}", parameter="network")
+    name = str(getattr(predictor, "name", predictor.kind)).rpartition(":")[2].rpartition(".")[2]
+    folder = FilePath(importlib.import_module("magtwin.twin.authoring").new_workshop())
+    predictor.save(folder / f"{name}.safetensors")
+    return folder / f"{name}.safetensors"
 
 
 class _TemporaryStage:

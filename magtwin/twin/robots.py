@@ -16,7 +16,7 @@ from magtwin.spec.scene import Scene
 from magtwin.twin.opening import led_by
 from magtwin.twin.session import in_session, room_of, with_plant
 from magtwin.twin.simulation import check_commands, finisher
-from magtwin.twin.twin import Kind, Session, Twin, checked_seed, opened
+from magtwin.twin.twin import Kind, Network, Session, Twin, checked_seed, opened
 
 if TYPE_CHECKING:
     from magtwin.sim.motion.commands import Commands
@@ -34,7 +34,7 @@ def simulate_robots(
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
-    network: str | FilePath | None = None,
+    network: Network = None,
     magnetometer: Kind | None = None,
     model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",

@@ -16,7 +16,17 @@ from magtwin.sim.motion.drive_input import DriveInput, drive_input, path_metadat
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.scene import Scene
 from magtwin.twin.session import in_session, in_session_of, model_error_of, room_of, trained_on, with_plant
-from magtwin.twin.twin import OF_SCENE, Kind, Metadata, Session, Twin, checked_seed, opened, scene_sha256
+from magtwin.twin.twin import (
+    OF_SCENE,
+    Kind,
+    Metadata,
+    Network,
+    Session,
+    Twin,
+    checked_seed,
+    opened,
+    scene_sha256,
+)
 from magtwin.version import __version__
 
 if TYPE_CHECKING:
@@ -43,7 +53,7 @@ def simulate(
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
-    network: str | FilePath | None = None,
+    network: Network = None,
     magnetometer: Kind | None = None,
     model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",

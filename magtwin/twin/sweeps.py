@@ -20,7 +20,7 @@ from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.twin.session import in_session, model_error_of, room_of, trained_on, with_plant
 from magtwin.twin.simulation import check_commands, finished, stated
-from magtwin.twin.twin import Kind, Twin, checked_seed, opened, scene_sha256, without_model_error
+from magtwin.twin.twin import Kind, Network, Twin, checked_seed, opened, scene_sha256, without_model_error
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer
@@ -60,7 +60,7 @@ def sweep(
     block: int | None = None,
     duration_s: float | None = None,
     rate_hz: float | None = None,
-    network: str | FilePath | None = None,
+    network: Network = None,
     magnetometer: Kind | None = None,
     model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",

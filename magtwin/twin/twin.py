@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -22,6 +22,8 @@ from magtwin.spec.sensors import MagnetometerSpec
 
 if TYPE_CHECKING:
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+    from magtwin.learn.models.predictor import Predictor
+    from magtwin.learn.training.result import TrainingResult
     from magtwin.sim.sensors.model_error import ModelError
     from magtwin.usd.scene import OpenedScene
 
@@ -32,6 +34,9 @@ Session = int | Literal["survey"]
 """Number of a session, or the robot as it was when the map was surveyed."""
 
 Metadata = dict[str, str | int | float | bool]
+
+Network: TypeAlias = "str | FilePath | Predictor | TrainingResult | None"
+"""Weights of a neural magnetometer: a file, a predictor, or what `magtwin.train` gives. None: the scene's."""
 
 
 OF_SCENE = "of the scene"
@@ -104,7 +109,7 @@ class Twin(Summarized):
 
 def opened(
     twin: Twin | Scene | str | FilePath,
-    network: str | FilePath | None,
+    network: Network,
     magnetometer: Kind | None,
     model_error: bool,
     function: str,
