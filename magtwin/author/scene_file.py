@@ -29,6 +29,10 @@ from magtwin.usd.layers import layer_sha256
 from magtwin.usd.robot import load_robot
 
 
+PARTS = ("drive", "battery", "platform", "magnetometer", "imu", "lidar", "mocap")
+"""Tables below [robot] whose keys replace those of an asset one by one; [robot.plant] replaces all."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class _RobotTable(RobotSettings):
     """The robot: an asset, or a URDF with further settings. For several robots, write one [[robot]] each."""
@@ -123,6 +127,7 @@ def scene_from_toml(
     robot: Path | None = None,
     name: str = "",
     scale: float = 1.0,
+    table: Mapping[str, Any] | None = None,
     inputs_of: Callable[[Path], tuple[str, ...]] = lambda weights: (),
     survey_of: Callable[[Scene, SurveySpec, int, Obstacles], Path] | None = None,
 ) -> Scene:
@@ -138,6 +143,7 @@ def scene_from_toml(
             surveyed by this robot, if the TOML has an Earth field.
         name: Name of the scene, in place of the TOML's.
         scale: Factor on the floor and on the places of furniture and sources; their sizes stay.
+        table: The tables, if they are not in a file: `path` then stands for them in messages.
         inputs_of: Function from a weights file to the names of its inputs, see
             `magtwin.twin.scene_from_toml`. By default the scene names no inputs.
         survey_of: Function that surveys a scene without a map and returns the map layer. It gets the scene,
@@ -146,7 +152,7 @@ def scene_from_toml(
     Raises:
         InputError: A key is unknown or missing, or a file is missing; the text has file and line.
     """
-    table = read_toml(path)
+    table = read_toml(path) if table is None else dict(table)
     if name:
         table["name"] = name
     if robot is not None:
@@ -280,11 +286,11 @@ def _robot(
     if named and not table.name:
         raise InputError(f'{where} needs name = "NAME", the name of its prim')
     if table.asset is not None and table.urdf is None:
-        known = {"asset", "network", "kind", "start", "path", "plant", *(["name"] if named else [])}
-        if others := sorted(set(keys) - known):
+        if others := sorted({"conversion", *(() if named else ("name",))} & set(keys)):
             raise InputError(f"{where} {others[0]} goes with urdf; an asset has it already")
         robot = load_robot(asset_named(table.asset, keys["asset"], where))
-        robot = replace(robot, plant=table.plant.spec) if "plant" in keys else robot
+        with _about(where):
+            robot = _changed(robot, table, keys)
     elif table.urdf is None or table.asset is not None:
         raise InputError(f'{where} needs asset = "FILE.usda" or urdf = "FILE.urdf", and not both')
     elif workshop is None:
@@ -300,6 +306,18 @@ def _robot(
             build_robot(table.urdf, settings, asset)
         robot = load_robot(asset, own=True)
     return replace(robot, name=table.name) if named else robot
+
+
+def _changed(robot: RobotSpec, table: RobotSettings, keys: Mapping[str, Any]) -> RobotSpec:
+    """The robot of an asset with what its table gives: of each part, the keys that are there."""
+    for name in PARTS:
+        if name in keys:
+            given = {key: getattr(getattr(table, name), key) for key in keys[name]}
+            robot = robot.with_part(name, replace(getattr(robot, name), **given))
+    robot = replace(robot, plant=table.plant.spec) if "plant" in keys else robot
+    if table.footprint_radius_m is not None:
+        robot = replace(robot, footprint_radius_m=table.footprint_radius_m)
+    return robot
 
 
 def _with_network(

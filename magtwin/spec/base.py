@@ -4,7 +4,10 @@ A spec is plain data: `usd/` reads and authors it, `sim/` runs it. Each field is
 is checked when the spec is made. Lengths are metres, angles radians, fields nT.
 """
 
+import functools
 import math
+import types
+import typing
 from dataclasses import MISSING, Field, fields, is_dataclass
 from typing import Any
 
@@ -23,19 +26,62 @@ UNIT_TOLERANCE = 1e-6
 """Largest error of the squared length of a unit quaternion; single precision passes."""
 
 
+KEY = "key"
+"""Metadata of a field: its key in a TOML, if that is not its name; None if a TOML does not have it."""
+
 LATER = "later"
 """Metadata of a field that a later version added: `spelled` leaves it out while it has its default."""
 
 
+ONE, ANY = 0, -1
+"""Width of a field that is one number, and of a tuple of any length."""
+
+
+@functools.cache
+def _widths(cls: type) -> dict[str, int]:
+    """How many numbers each field of a spec has, of those that are numbers."""
+    widths = {}
+    for name, kind in typing.get_type_hints(cls).items():
+        some = [a for a in typing.get_args(kind) if a is not type(None)]
+        if isinstance(kind, types.UnionType) and len(some) == 1:
+            kind, some = some[0], list(typing.get_args(some[0]))
+        if kind in (float, int):
+            widths[name] = ONE
+        elif typing.get_origin(kind) is tuple and set(some) <= {float, int, Ellipsis}:
+            widths[name] = ANY if Ellipsis in some else len(some)
+    return widths
+
+
+def _are_numbers(value: Any, width: int) -> bool:
+    if width == ONE:
+        return isinstance(value, int | float)
+    if not isinstance(value, tuple) or width not in (ANY, len(value)):
+        return False
+    return all(isinstance(x, int | float) for x in value)
+
+
 class Spec:
-    """Base class of all specs: every number is finite."""
+    """Base class of all specs: every number is one and finite. Lists and arrays become tuples."""
 
     def __post_init__(self) -> None:
+        widths = _widths(type(self))
         for f in fields(self):  # type: ignore[arg-type]
             value = getattr(self, f.name)
+            if f.name in widths and not _are_numbers(value, widths[f.name]):
+                value = self._numbers(f.name, value, widths[f.name])
             numbers = value if isinstance(value, tuple) else (value,)
             finite = all(abs(x) < math.inf for x in numbers if isinstance(x, int | float))
             self._require(f.name, finite, "be finite", value)
+
+    def _numbers(self, name: str, given: Any, width: int) -> Any:
+        """The value of a field of numbers, from NumPy's or a list's."""
+        value = given.tolist() if hasattr(given, "tolist") else given
+        value = tuple(value) if isinstance(value, list) and width != ONE else value
+        if value is not None:  # of a field that may be None; others are refused where they are used
+            what = {ONE: "be a number", ANY: "be numbers"}.get(width, f"be {width} numbers")
+            self._require(name, _are_numbers(value, width), what, given)
+            object.__setattr__(self, name, value)
+        return value
 
     def _require(self, name: str, holds: bool, what: str, value: Any) -> None:
         if not holds:
