@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from magtwin.author.scene_file import SceneFile
+from magtwin.spec.base import KEY
 from magtwin.spec.furniture import GENERIC, KINDS, MATERIALS, STEEL, parts_of
 
 HERE = Path(__file__).resolve().parent
@@ -216,8 +217,10 @@ def _table(cls: type, section: str, about: str, *, many: bool = False) -> list[s
     lines += ["\n| key | type | unit | default | meaning |\n|---|---|---|---|---|\n"]
     docs, hints, below = field_docs(cls), typing.get_type_hints(cls), []
     for field in dataclasses.fields(cls):
+        if (key := field.metadata.get(KEY, field.name)) is None:
+            continue
         kind, array = _inner(hints[field.name])
-        name = f"{section}.{field.name}" if section else field.name
+        name = f"{section}.{key}" if section else key
         if dataclasses.is_dataclass(kind):
             below.append((kind, name, docs.get(field.name, ""), array))
             continue
@@ -225,7 +228,7 @@ def _table(cls: type, section: str, about: str, *, many: bool = False) -> list[s
         units = list(dict.fromkeys(re.findall(UNIT, text)))
         meaning = re.sub(f" {UNIT}", "", text) if len(units) == 1 else text
         kind, unit = _kind(hints[field.name]), ", ".join(units)
-        cells = [f"`{field.name}`", kind, unit, _default(field), meaning]
+        cells = [f"`{key}`", kind, unit, _default(field), meaning]
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n")
     below.sort(key=lambda entry: entry[1] in LATER)
     for kind, name, text, array in below:

@@ -32,6 +32,9 @@ DRAWN_A_M = (500.0, 5000.0)
 HUGE_M = 30.0
 """Size of a mesh above which it is likely to be in millimetres [m]."""
 
+REINFORCED = 0.01
+"""Fraction of reinforced concrete that is steel, some 80 kg/m3."""
+
 WALL_M = 0.002
 """Thickness of the steel of a box, cylinder or mesh, since most are hollow [m]."""
 
@@ -63,8 +66,7 @@ class FurnitureTable(Spec):
     """Volume susceptibility of the steel [1]. Above 0, the Earth's field magnetises it too."""
 
     material: str = ""
-    """Material of a box, cylinder or mesh: steel, painted_steel, wood, concrete, brick, plastic or aluminium.
-    Only the steels are magnetised."""
+    """Material of a box, cylinder or mesh, see the materials above. Only those with steel are magnetised."""
 
     size_m: Vec3 = ZERO3
     """Depth, width and height of a box; diameter, diameter and height of a cylinder [m]."""
@@ -159,6 +161,8 @@ def drawn_magnetization(name: str, parts: Iterable[Part], *, seed: int = 0) -> t
 
 def _steel_fraction(part: Part) -> float:
     """Fraction of a part's volume that is steel; a generic part is a shell of `WALL_M`."""
+    if part.look == "ReinforcedConcrete":
+        return REINFORCED
     if part.name != BODY:
         return part.fill
     if not part.faces:
@@ -180,16 +184,20 @@ def check_stands(piece: FurnitureSpec, lab: LabSpec) -> None:
     signs = np.array(np.meshgrid((-1, 1), (-1, 1), (-1, 1))).reshape(3, -1).T
     corners = np.concatenate([np.array(p.p) + signs * np.array(p.size_m) / 2 for p in piece.parts])
     world = rotate(piece.q_world_xyzw, corners) + piece.p_world
-    half = np.array(lab.floor_m) / 2 + lab.wall_thickness_m + lab.apron_m
-    beyond = float(np.max(np.abs(world[:, :2]) - half))
+    x0, x1, y0, y1 = lab.extent_m
+    middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2]) if lab.floor else np.zeros(2)
+    half = np.array([x1 - x0, y1 - y0]) / 2 + lab.wall_thickness_m + lab.apron_m
+    beyond = float(np.max(np.abs(world[:, :2] - middle) - half))
     if beyond > 1e-6:
         x, y = piece.p_world[:2]
         size, hint = np.ptp(world, axis=0), ""
+        floor = "floor" if lab.floor else "floor_m"
+        about = f"({middle[0]:g}, {middle[1]:g})" if lab.floor else "the origin"
         if any(part.faces for part in piece.parts) and size.max() > HUGE_M:
             hint = f"; it is {size[0]:.3g} x {size[1]:.3g} m: is its file in mm? then scale = 0.001"
         raise InputError(
             f"p_world of {piece.name!r} is ({x:g}, {y:g}): it reaches {beyond:.2f} m beyond the slab, "
-            f"which is {2 * half[0]:g} x {2 * half[1]:g} m about the origin; move it, or enlarge floor_m or "
+            f"which is {2 * half[0]:g} x {2 * half[1]:g} m about {about}; move it, or enlarge {floor} or "
             f"apron_m of [lab]{hint}"
         )
 

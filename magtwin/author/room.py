@@ -88,13 +88,15 @@ def lab_of(
     Raises:
         InputError: A length cannot be in metres.
     """
-    if map_layer is not None and "floor_m" not in table.get("lab", {}):
+    if map_layer is not None and not {"floor_m", "floor"} & set(table.get("lab", {})):
         x0, x1, y0, y1 = load_map(map_layer).extent
         floor = 2 * max(abs(x0), abs(x1)), 2 * max(abs(y0), abs(y1))
         lab = replace(lab, floor_m=(round(floor[0], 6), round(floor[1], 6)))
-    if max(lab.floor_m) > LARGEST_M:
-        text = f"floor_m must be in metres, at most {LARGEST_M:g} each way, got {lab.floor_m}"
-        raise refused_at(path, "floor_m", text, section="lab")
+    x0, x1, y0, y1 = lab.extent_m
+    if max(x1 - x0, y1 - y0) > LARGEST_M:
+        key = "floor" if lab.floor else "floor_m"
+        text = f"{key} must be in metres, at most {LARGEST_M:g} each way, got {(x1 - x0, y1 - y0)}"
+        raise refused_at(path, key, text, section="lab")
     for key in ("wall_height_m", "wall_thickness_m", "post_height_m", "apron_m"):
         if getattr(lab, key) > LARGEST_M:
             text = f"{key} must be in metres, at most {LARGEST_M:g}, got {getattr(lab, key):g}"

@@ -7,10 +7,13 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from magtwin.author.furniture import FurnitureTable, placed_furniture
 from magtwin.author.robot import RobotSettings, build_robot
 from magtwin.author.room import asset_named, check_name, check_start, lab_of, obstacles_in
 from magtwin.author.scene import check_names, check_things
+from magtwin.author.walls import DoorTable, WallTable, check_not_in_walls, lab_with_walls
 from magtwin.errors import InputError
 from magtwin.files.file import existing_file, sha256
 from magtwin.files.kinds import expected
@@ -24,6 +27,7 @@ from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import PlacedRobot, RobotSpec
 from magtwin.spec.scene import Scene
+from magtwin.spec.walls import Window
 from magtwin.usd.lab.earth import checked
 from magtwin.usd.layers import layer_sha256
 from magtwin.usd.robot import load_robot
@@ -99,6 +103,9 @@ class SceneFile:
     """Seed of the default magnetization of furniture, and of the survey's noise."""
 
     lab: LabSpec = field(default_factory=LabSpec)
+    wall: tuple[WallTable, ...] = ()
+    door: tuple[DoorTable, ...] = ()
+    window: tuple[Window, ...] = ()
     earth: _EarthTable | None = None
     survey: SurveySpec | None = None
     sources: _SourcesTable | None = None
@@ -173,6 +180,7 @@ def scene_from_toml(
     if layer is not None:
         layer = existing_file(layer, "map layer", "USD")
     lab = lab_of(given.lab, table, path, layer)
+    lab = lab_with_walls(lab, given.wall, given.door, given.window, path, seed=given.seed)
     pieces = placed_furniture(given.furniture, lab, path, seed=given.seed)
     sources = given.source
     if given.sources:
@@ -187,6 +195,7 @@ def scene_from_toml(
     with _about(f"{path}:"):
         check_names(sources, pieces)
     standing = obstacles_in(lab, pieces)
+    check_not_in_walls(pieces[len(pieces) - len(given.furniture) :], lab, standing, path)
     robots: list[PlacedRobot] = []
     for number, (robot_table, keys) in enumerate(zip(given.robot, table["robot"], strict=True)):
         where = f"{path}: [robot]" if alone else f"{path}: [[robot]] {robot_table.name!r}"
@@ -270,7 +279,15 @@ def _scaled(table: Mapping[str, Any], scale: float) -> dict[str, Any]:
     lab = dict(table.get("lab", {}))
     if "floor_m" in lab:
         lab["floor_m"] = [round(side * scale, 3) for side in lab["floor_m"]]
+    if "floor" in lab:
+        lab["floor"] = [[c * scale for c in corner] for corner in lab["floor"]]
     things = {key: [placed(thing) for thing in table[key]] for key in ("furniture", "source") if key in table}
+    for key in ("wall", "door", "window"):
+        places = ("from", "to", "at_m")
+        things[key] = [
+            {k: (np.multiply(v, scale).tolist() if k in places else v) for k, v in thing.items()}
+            for thing in table.get(key, [])
+        ]
     return {**table, "lab": lab, **things}
 
 

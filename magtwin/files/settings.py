@@ -138,7 +138,9 @@ def from_table(
 def _from_table(cls: type[T], table: dict[str, Any], where: "_Where") -> T:
     """As `from_table`."""
     hints = typing.get_type_hints(cls)
-    known = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    # the key of a field may differ from its name, or be None (`magtwin.spec.base.KEY`)
+    known = {f.metadata.get("key", f.name): f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    known.pop(None, None)
     for key in table:
         if key not in known:
             raise where.refused(key, f"unknown key {key!r}; {hint(key, known)}")
@@ -149,11 +151,12 @@ def _from_table(cls: type[T], table: dict[str, Any], where: "_Where") -> T:
             and spec.default_factory is dataclasses.MISSING
         ):
             raise where.refused("", f"key {name!r} is missing; add it")
-    values = {key: _value(hints[key], value, where, key) for key, value in table.items()}
+    values = {known[key].name: _value(hints[known[key].name], v, where, key) for key, v in table.items()}
     try:
         return cls(**values)
     except InputError as error:
-        raise where.refused(next((k for k in values if k in str(error)), ""), str(error)) from error
+        named = (key for key in table if known[key].name in str(error))
+        raise where.refused(next(named, ""), str(error)) from error
 
 
 def from_values(cls: type[T], values: Mapping[str, Any], what: str) -> T:
@@ -277,7 +280,8 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
 
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
-        return _value(next(a for a in args if a is not type(None)), value, where, key)
+        some = [a for a in args if a is not type(None)]
+        return _value(type(value) if type(value) in some else some[0], value, where, key)
     if dataclasses.is_dataclass(kind):
         if not isinstance(value, dict):
             raise wrong()

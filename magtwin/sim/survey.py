@@ -21,7 +21,7 @@ from magtwin.parallel import run_all
 from magtwin.sim.at_rest import field_at_rest_nt, in_steel, places_at_rest, sensor_height_m
 from magtwin.sim.interference import ambient_field_nt, ambient_gradient_nt_m, platform_field_nt
 from magtwin.sim.sensors.magnetometer import lost_in, rounded, stuck_nt
-from magtwin.spec.lab import SurveySpec
+from magtwin.spec.lab import SurveySpec, on_polygon
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import Scene
 
@@ -101,8 +101,7 @@ def visit(
     height = sensor_height_m(scene) if height_m is None else height_m
     if not 0 <= height < np.inf:
         raise InputError(f"height_m must be a height above the floor, 0 m or more, got {height!r}")
-    x, y = scene.lab.floor_m
-    grid = Grid.over((-x / 2, x / 2, -y / 2, y / 2), spacing_m, np.asarray(headings_rad, float))
+    grid = Grid.over(scene.lab.extent_m, spacing_m, np.asarray(headings_rad, float))
     node, nominal = grid.poses()
     stands, yaw = node, nominal
     if position_error_m:
@@ -390,10 +389,13 @@ def blocked_by(scene: Scene, obstacles: Obstacles) -> Callable[[Array], NDArray[
     Returns:
         A function from nodes [m], shape (..., 2), to whether each is blocked, shape (...).
     """
-    half = np.array(scene.lab.floor_m) / 2
+    half, floor = np.array(scene.lab.floor_m) / 2, scene.lab.floor
     inner = [
         k for k, o in enumerate(obstacles.outlines) if np.all(np.abs(_nearest_to_middle(o)) < half - 1e-6)
     ]
+    if floor:
+        sides = [side.name for side in scene.lab.sides]
+        inner = [k for k, name in enumerate(obstacles.names) if name.split("/")[-2] not in sides]
     standing = Obstacles(
         tuple(obstacles.names[k] for k in inner), tuple(obstacles.outlines[k] for k in inner)
     )
@@ -403,7 +405,8 @@ def blocked_by(scene: Scene, obstacles: Obstacles) -> Callable[[Array], NDArray[
         p = nodes.reshape(-1, 2)
         distance, _ = standing.clearance(p, reach_m=radius)
         inside = in_steel(scene, p, sensor_height_m(scene))
-        return np.asarray((distance < radius) | inside).reshape(nodes.shape[:-1])
+        off = ~on_polygon(p, floor) if floor else False
+        return np.asarray((distance < radius) | inside | off).reshape(nodes.shape[:-1])
 
     return blocked
 

@@ -57,7 +57,7 @@ class Part:
         return self.size_m.index(max(self.size_m))
 
 
-STEEL = ("Steel", "PaintedSteel", "Door", "Chrome", "Enamel")
+STEEL = ("Steel", "PaintedSteel", "Door", "Chrome", "Enamel", "ReinforcedConcrete")
 """Looks of parts that can be magnetised."""
 
 MATERIALS: Mapping[str, str] = MappingProxyType(
@@ -66,12 +66,16 @@ MATERIALS: Mapping[str, str] = MappingProxyType(
         "painted_steel": "PaintedSteel",
         "wood": "Wood",
         "concrete": "Concrete",
+        "reinforced_concrete": "ReinforcedConcrete",
         "brick": "Brick",
+        "plasterboard": "Plasterboard",
+        "plywood": "Wall",
+        "glass": "Glass",
         "plastic": "Plastic",
         "aluminium": "Aluminium",
     }
 )
-"""Look of each material of a box, cylinder or mesh. Only the steels are magnetised."""
+"""Look of each material of a wall, box, cylinder or mesh. Only those with steel are magnetised."""
 
 GENERIC = ("box", "cylinder", "mesh")
 """Kinds of one part, with a material and a size."""

@@ -67,11 +67,11 @@ class Scene(Summarized, Spec):
 
     def _summary(self) -> Summary:
         """Name and floor; robots; map; field; paths; furniture."""
-        width, depth = self.lab.floor_m
+        x0, x1, y0, y1 = self.lab.extent_m
         robots = [f"{p.robot.name} ({p.robot.magnetometer.kind} magnetometer)" for p in self.robots]
         field = "no Earth's field" if self.earth is None else f"Earth's field of {self.earth.date}"
         return Summary(
-            f"Scene {self.name}: floor {width:g} x {depth:g} m",
+            f"Scene {self.name}: floor {x1 - x0:g} x {y1 - y0:g} m",
             (
                 ("robots" if self.others else "robot", listed(robots, 80)),
                 ("map", str(self.map_layer)),
@@ -81,10 +81,13 @@ class Scene(Summarized, Spec):
                 ),
                 ("path", listed([str(placed.path) or "not set" for placed in self.robots])),
                 ("furniture", listed([piece.name for piece in self.furniture], 200)),
+                ("walls", listed([wall.name for wall in self.lab.walls], 80)),
+                ("doors", listed([f"{door.name} at {door.open_deg:g} deg" for door in self.lab.doors], 80)),
             ),
         )
 
     @property
     def magnets(self) -> tuple[SourceSpec, ...]:
-        """All magnetised things: the sources, and the steel of the furniture."""
-        return (*self.sources, *(source for piece in self.furniture for source in steel_of(piece)))
+        """All magnetised things: the sources, and the steel of the furniture, walls and doors."""
+        steel = (source for piece in self.furniture for source in steel_of(piece))
+        return (*self.sources, *steel, *self.lab.magnets)

@@ -167,7 +167,8 @@ def _usd_value(attribute: Usd.Attribute, value: Any) -> Any:
     if kind == Sdf.ValueTypeNames.Matrix3d:
         return Gf.Matrix3d(*value)
     if kind.isArray:
-        return kind.type.pythonClass(value)
+        points = isinstance(kind.defaultValue, Vt.Vec2dArray)
+        return kind.type.pythonClass([Gf.Vec2d(*each) for each in value] if points else value)
     return tuple(value) if isinstance(value, tuple) else value
 
 
@@ -200,4 +201,6 @@ def _value(attribute: Usd.Attribute) -> Any:
         return tuple(float(x) for row in value for x in row)
     if isinstance(value, Gf.Vec3d | Gf.Vec2d):
         return tuple(map(float, value))
+    if isinstance(value, Vt.Vec2dArray):
+        return tuple((float(x), float(y)) for x, y in value)
     return tuple(value) if isinstance(value, Vt.StringArray | Vt.DoubleArray) else value

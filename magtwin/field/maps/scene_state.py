@@ -16,6 +16,7 @@ from magtwin.spec.furniture import FurnitureSpec, steel_of
 from magtwin.spec.magnetics import SourceSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
+from magtwin.spec.walls import Door, Wall, Window
 
 DECIMALS = 9
 """Decimal places of the numbers in a checksum: a value that passed through a transform keeps its checksum."""
@@ -46,9 +47,10 @@ def made_from(scene: Scene, *, height_m: float | None = None) -> MadeFrom:
 
 
 def _bodies(scene: Scene) -> dict[str, str]:
-    """Checksum of each source and each piece of furniture with steel, by name."""
-    things: list[SourceSpec | FurnitureSpec] = list(scene.sources)
+    """Checksum of each source and of each wall, door and piece of furniture with steel, by name."""
+    things: list[SourceSpec | FurnitureSpec | Wall | Door | Window] = list(scene.sources)
     things += [piece for piece in scene.furniture if steel_of(piece)]
+    things += scene.lab.structure.magnetic()
     found: dict[str, str] = {}
     for thing in things:
         name = thing.name if thing.name not in found else f"{thing.name} "  # a piece named like a source

@@ -4,26 +4,26 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from pxr import Kind, Sdf, Usd, UsdGeom, UsdPhysics, Vt
+from pxr import Kind, Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
 from magtwin.frames import IDENTITY_XYZW
-from magtwin.spec.furniture import BODY, GENERIC, FurnitureSpec, Part, parts_of
+from magtwin.spec.furniture import BODY, GENERIC, FurnitureSpec, parts_of
 from magtwin.spec.magnetics import SourceSpec
 from magtwin.usd.attributes import check_prim_name, plain_value, write_pose
-from magtwin.usd.lab.looks import define_box, define_looks, define_visual, hide, visual_path, wear
+from magtwin.usd.lab.looks import define_looks
+from magtwin.usd.lab.parts import define_part, named_source
 from magtwin.usd.lab.sources import (
     LOOKS,
     SOURCES,
-    define_source,
     read_source,
     read_transform,
     source_prims,
 )
+from magtwin.usd.lab.walls import read_walls
 from magtwin.usd.layers import WORLD
 from magtwin.usd.placement import labs_on
 from magtwin.usd.schema import apply_api, attribute_name, author, has_api, place, prims_with
-from magtwin.usd.solids import define_triangles
 
 FURNITURE = WORLD.AppendChild("Furniture")
 KIND = attribute_name("furniture", "kind")
@@ -56,33 +56,8 @@ def define_furniture(stage: Usd.Stage, furniture: tuple[FurnitureSpec, ...]) -> 
         define_looks(stage, path.AppendChild(LOOKS), dict.fromkeys(part.look for part in parts))
         steel = {source.name.removeprefix(f"{spec.name}_"): source for source in spec.sources(in_world=False)}
         for part in parts:
-            prim = _define_part(stage, path, part, steel.get(part.name))
+            prim = define_part(stage, path, part, steel.get(part.name))
             UsdPhysics.CollisionAPI.Apply(prim)
-
-
-def _define_part(stage: Usd.Stage, piece: Sdf.Path, part: Part, source: SourceSpec | None) -> Usd.Prim:
-    """The collider of a part, and a mesh that shows it; a steel part is a source."""
-    path, look = piece.AppendChild(part.name), piece.AppendChild(LOOKS).AppendChild(part.look)
-    if source is not None:
-        return define_source(stage, piece, _named(source, part.name), look=part.look)
-    if part.shape == "cuboid":
-        return define_box(stage, path, part.p, part.size_m, look, collides=True)
-    if part.shape == "mesh":
-        mesh = UsdGeom.Mesh.Define(stage, path)
-        define_triangles(mesh, part.vertices_m, part.faces)
-        write_pose(mesh.GetPrim(), part.p)
-        wear(mesh, look)
-        return mesh.GetPrim()
-    cylinder = UsdGeom.Cylinder.Define(stage, path)
-    radius, half = part.size_m[0] / 2, part.size_m[2] / 2
-    cylinder.CreateRadiusAttr(radius)
-    cylinder.CreateHeightAttr(2 * half)
-    cylinder.CreateAxisAttr(UsdGeom.Tokens.z)
-    cylinder.CreateExtentAttr(Vt.Vec3fArray([(-radius, -radius, -half), (radius, radius, half)]))
-    write_pose(cylinder.GetPrim(), part.p)
-    hide(cylinder, look)
-    define_visual(stage, visual_path(path), part.shape, part.p, part.size_m, look)
-    return cylinder.GetPrim()
 
 
 def read_magnets(stage: Usd.Stage) -> tuple[tuple[SourceSpec, ...], tuple[FurnitureSpec, ...]]:
@@ -101,6 +76,8 @@ def read_magnets(stage: Usd.Stage) -> tuple[tuple[SourceSpec, ...], tuple[Furnit
         if has_api(root, "furniture") and (piece := _whole(root, prims)):
             pieces.append(piece)
             taken |= {prim.GetPath() for prim in prims if prim.GetPath().HasPrefix(root.GetPath())}
+    for lab in prims_with(stage.GetPseudoRoot(), "lab"):
+        taken |= read_walls(lab).sources
     sources: list[SourceSpec] = []
     names: set[str] = set()
     labs = {lab.root.GetPath() for lab in labs_on(stage)} - {Sdf.Path.absoluteRootPath}
@@ -141,7 +118,8 @@ def _whole(root: Usd.Prim, prims: list[Usd.Prim]) -> FurnitureSpec | None:
     except InputError:  # it has more parts, or fewer
         return None
     wanted = [
-        _named(source, source.name.removeprefix(f"{spec.name}_")) for source in spec.sources(in_world=False)
+        named_source(source, source.name.removeprefix(f"{spec.name}_"))
+        for source in spec.sources(in_world=False)
     ]
     return spec if steel == wanted else None
 
@@ -164,10 +142,6 @@ def _generic(root: Usd.Prim, kind: str) -> dict[str, Any]:
         "vertices_m": tuple(map(tuple, points.tolist())),
         "faces": tuple(map(tuple, faces.reshape(-1, 3).tolist())),
     }
-
-
-def _named(source: SourceSpec, name: str) -> SourceSpec:
-    return SourceSpec(**{**vars(source), "name": name})
 
 
 def _name(prim: Usd.Prim, root: Sdf.Path, taken: set[str]) -> str:

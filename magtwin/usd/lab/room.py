@@ -5,16 +5,20 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, Vt
 
 from magtwin.frames import quat_from_rpy
 from magtwin.spec.lab import LabSpec
-from magtwin.usd.attributes import read_spec, write_pose, write_spec
-from magtwin.usd.lab.looks import define_box, define_looks, define_visual, hide
+from magtwin.usd.attributes import write_pose, write_spec
+from magtwin.usd.lab.looks import define_box, define_looks, define_visual, hide, wear
+from magtwin.usd.lab.walls import define_walls
+from magtwin.usd.lab.walls import read_lab as read_lab
 from magtwin.usd.layers import WORLD
 from magtwin.usd.schema import apply_api
+from magtwin.usd.solids import define_triangles
 
 LAB = WORLD.AppendChild("Lab")
 PHYSICS_SCENE = WORLD.AppendChild("PhysicsScene")
 LOOKS = LAB.AppendChild("Looks")
 FLOOR, WALL, POST, CAMERA, LENS = map(LOOKS.AppendChild, ("Floor", "Wall", "Post", "Camera", "Lens"))
 
+STRUCTURE = ("walls", "doors", "windows")  # fields of a room that have prims of their own
 GRAVITY_M_S2 = 9.81
 FLOOR_THICKNESS_M = 0.1
 POST_WIDTH_M = 0.04
@@ -50,19 +54,28 @@ def define_lab(stage: Usd.Stage, spec: LabSpec) -> Usd.Prim:
     Returns:
         The prim of the lab.
     """
-    lab = write_spec(apply_api(UsdGeom.Xform.Define(stage, LAB).GetPrim(), "lab"), "lab", spec)
+    lab = write_spec(
+        apply_api(UsdGeom.Xform.Define(stage, LAB).GetPrim(), "lab"), "lab", spec, skip=STRUCTURE
+    )
     scene = UsdPhysics.Scene.Define(stage, PHYSICS_SCENE)
     scene.CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
     scene.CreateGravityMagnitudeAttr(GRAVITY_M_S2)
     define_looks(stage, LOOKS, [look.name for look in (FLOOR, WALL, POST, CAMERA, LENS)])
-    x, y = spec.floor_m
-    edge = 2 * (spec.wall_thickness_m + spec.apron_m)  # walls and posts stand on the slab too
-    size = (x + edge, y + edge, FLOOR_THICKNESS_M)
-    define_box(stage, LAB.AppendChild("Floor"), (0, 0, -FLOOR_THICKNESS_M / 2), size, FLOOR)
-    _define_ground(stage, size[:2])
-    _define_walls(stage, spec)
+    x0, x1, y0, y1 = spec.extent_m
+    edge = spec.wall_thickness_m + spec.apron_m  # walls and posts stand on the slab too
+    size, middle = (x1 - x0 + 2 * edge, y1 - y0 + 2 * edge), ((x0 + x1) / 2, (y0 + y1) / 2)
+    if spec.floor:
+        _define_slab(stage, spec, edge)
+    else:
+        centre = (0, 0, -FLOOR_THICKNESS_M / 2)
+        define_box(stage, LAB.AppendChild("Floor"), centre, (*size, FLOOR_THICKNESS_M), FLOOR)
+    _define_ground(stage, size, middle if spec.floor else None)
+    if spec.floor or spec.walls or spec.doors or spec.windows:
+        define_walls(stage, spec)
+    else:
+        _define_low_walls(stage, spec)
     _define_frame(stage, spec)
-    _define_lights(stage, spec)
+    _define_lights(stage, spec, middle)
     return lab
 
 
@@ -76,28 +89,34 @@ def expose_for_kit(layer: Sdf.Layer) -> None:
     layer.customLayerData = {**layer.customLayerData, "renderSettings": settings}
 
 
-def read_lab(prim: Usd.Prim) -> LabSpec:
-    """The spec of an authored lab.
+def _define_slab(stage: Usd.Stage, spec: LabSpec, edge: float) -> None:
+    """The slab of a floor with corners, `edge` wider all around [m]."""
+    from manifold3d import CrossSection, FillRule, JoinType, Manifold  # takes 0.05 s
 
-    Raises:
-        InputError: The prim is no lab, or a value is out of range.
-    """
-    return read_spec(LabSpec, prim, "lab")
+    outline = CrossSection([np.array(spec.corners)], FillRule.Positive).offset(edge, JoinType.Miter, 2.0)
+    made = Manifold.extrude(outline, FLOOR_THICKNESS_M).translate((0, 0, -FLOOR_THICKNESS_M)).to_mesh()
+    mesh = UsdGeom.Mesh.Define(stage, LAB.AppendChild("Floor"))
+    define_triangles(mesh, np.asarray(made.vert_properties)[:, :3], made.tri_verts)
+    wear(mesh, FLOOR)
 
 
-def _define_ground(stage: Usd.Stage, size: tuple[float, float]) -> None:
-    """The collider of the floor, with the floor's size in viewers that show it [m]."""
+def _define_ground(
+    stage: Usd.Stage, size: tuple[float, float], middle: tuple[float, float] | None = None
+) -> None:
+    """The collider of the floor, with the floor's size in viewers that show it, and its middle [m]."""
     plane = UsdGeom.Plane.Define(stage, LAB.AppendChild("Ground"))
     plane.CreateAxisAttr(UsdGeom.Tokens.z)
     plane.CreateWidthAttr(size[0])
     plane.CreateLengthAttr(size[1])
     half = Gf.Vec3f(size[0] / 2, size[1] / 2, 0)
     plane.CreateExtentAttr(Vt.Vec3fArray([-half, half]))
+    if middle is not None:
+        write_pose(plane.GetPrim(), (*middle, 0.0))
     UsdPhysics.CollisionAPI.Apply(plane.GetPrim())
     hide(plane, FLOOR)
 
 
-def _define_walls(stage: Usd.Stage, spec: LabSpec) -> None:
+def _define_low_walls(stage: Usd.Stage, spec: LabSpec) -> None:
     if not spec.wall_height_m:
         return
     (x, y), thick, high = spec.floor_m, spec.wall_thickness_m, spec.wall_height_m
@@ -113,8 +132,11 @@ def _define_walls(stage: Usd.Stage, spec: LabSpec) -> None:
 
 
 def _define_frame(stage: Usd.Stage, spec: LabSpec) -> None:
-    """Posts at the corners and in the middle of the long sides, rails on top, a camera on each post."""
-    if not spec.post_height_m:
+    """Posts at the corners and in the middle of the long sides, rails on top, a camera on each post.
+
+    A floor with corners has none.
+    """
+    if not spec.post_height_m or spec.floor:
         return
     half = np.array(spec.floor_m) / 2 + spec.wall_thickness_m + POST_WIDTH_M / 2
     corners = [(sx * half[0], sy * half[1]) for sx in (-1, 1) for sy in (-1, 1)]
@@ -154,13 +176,14 @@ def _camera(stage: Usd.Stage, path: Sdf.Path, post_top: np.ndarray) -> None:
     )
 
 
-def _define_lights(stage: Usd.Stage, spec: LabSpec) -> None:
+def _define_lights(stage: Usd.Stage, spec: LabSpec, middle: tuple[float, float]) -> None:
     """An even sky, and four lamps in two rows above the floor."""
     root = UsdGeom.Xform.Define(stage, LAB.AppendChild("Lights")).GetPath()
     sky = UsdLux.DomeLight.Define(stage, root.AppendChild("Sky"))
     sky.CreateIntensityAttr(SKY)
     sky.CreateColorAttr(Gf.Vec3f(0.92, 0.96, 1.0))
-    quarter = np.array(spec.floor_m) / 4
+    x0, x1, y0, y1 = spec.extent_m
+    quarter = np.array([x1 - x0, y1 - y0]) / 4
     for i, (sx, sy) in enumerate([(-1, -1), (-1, 1), (1, -1), (1, 1)]):
         lamp = UsdLux.RectLight.Define(stage, root.AppendChild(f"Lamp_{i}"))  # shines along -z
         lamp.CreateWidthAttr(LAMP_SIZE_M[0])
@@ -168,4 +191,6 @@ def _define_lights(stage: Usd.Stage, spec: LabSpec) -> None:
         lamp.CreateIntensityAttr(LAMP)
         lamp.CreateNormalizeAttr(True)
         lamp.CreateColorAttr(Gf.Vec3f(1.0, 0.97, 0.92))
-        lamp.AddTranslateOp().Set(Gf.Vec3d(sx * quarter[0], sy * quarter[1], LAMP_HEIGHT_M))
+        lamp.AddTranslateOp().Set(
+            Gf.Vec3d(middle[0] + sx * quarter[0], middle[1] + sy * quarter[1], LAMP_HEIGHT_M)
+        )

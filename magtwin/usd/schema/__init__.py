@@ -42,6 +42,9 @@ NOUNS = {
     "plant": "MagtwinPlantAPI",
     "platform": "MagtwinPlatformFieldAPI",
     "lab": "MagtwinLabAPI",
+    "wall": "MagtwinWallAPI",
+    "door": "MagtwinDoorAPI",
+    "window": "MagtwinWindowAPI",
 }
 """Applied API schema of each noun; its attributes are named `magtwin:<noun>:<attribute>`."""
 

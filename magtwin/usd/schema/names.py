@@ -45,6 +45,9 @@ WITH_UNIT = {
         "accelVibration": "accelVibrationPerS",
     },
     "source": {"moment": "momentAm2", "magnetization": "magnetizationAPerM"},
+    "lab": {"floor": "floorCornersM"},
+    "wall": {"start": "startM", "end": "endM", "magnetization": "magnetizationAPerM"},
+    "door": {"magnetization": "magnetizationAPerM"},
     "mocap": {"angleNoiseStd": "angleNoiseStdRad"},
     "plant": {
         "motorAbsNtNm": "motorAbsNtPerNm",

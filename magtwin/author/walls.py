@@ -1,0 +1,137 @@
+"""Walls, doors and windows of a scene's TOML, their default magnetization, and what stands in them."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
+
+from magtwin.author.furniture import drawn_magnetization
+from magtwin.errors import InputError
+from magtwin.files.settings import refused_at
+from magtwin.spec.furniture import BODY, MATERIALS, FurnitureSpec, Part
+from magtwin.spec.lab import LabSpec
+from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.walls import NO_LEAF, Door, Structure, Wall, Window, overlap_m
+from magtwin.usd.lab.furniture import FURNITURE
+from magtwin.usd.lab.walls import WALLS
+
+W = TypeVar("W", Wall, Door)
+
+IN_WALL_M = 0.01
+"""Furniture that is not deeper in a wall than this touches it [m]."""
+
+
+@dataclass(frozen=True)
+class WallTable(Wall):
+    """A straight wall from point to point, in the room or around it."""
+
+    magnetization: float | None = None  # type: ignore[assignment]
+    """Magnetization along the wall [A/m]. Default: drawn from the seed, as for furniture: 5 to 50 A/m of
+    either sign for reinforced concrete, 0 without steel."""
+
+
+@dataclass(frozen=True)
+class DoorTable(Door):
+    """A door in a wall: an opening from the floor up, with a leaf that turns. An open door can be driven
+    through; a closed one is an obstacle.
+    """
+
+    magnetization: float | None = None  # type: ignore[assignment]
+    """Magnetization of the leaf along its longest side [A/m]. Default: drawn from the seed, as for furniture,
+    0 without steel."""
+
+
+def with_walls(
+    lab: LabSpec,
+    walls: Sequence[Wall],
+    doors: Sequence[Door],
+    windows: Sequence[Window] = (),
+    *,
+    seed: int = 0,
+) -> LabSpec:
+    """A room with walls, doors and windows; steel without a magnetization draws it from the seed.
+
+    Args:
+        lab: The room.
+        walls: Walls, or tables of walls, in order.
+        doors: Doors, or tables of doors, in order.
+        windows: Windows, in order.
+        seed: Seed of the scene.
+
+    Raises:
+        InputError: A door or window is in no wall or not within it, or a wall stands in one.
+    """
+    built = Structure.named(walls, doors, windows, lab.sides)
+    own_walls = tuple(_drawn(Wall, wall, wall.length_m, seed) for wall in built.walls)
+    own_doors = tuple(_drawn(Door, door, door.width_m, seed) for door in built.doors)
+    return replace(lab, walls=own_walls, doors=own_doors, windows=built.windows)
+
+
+def _drawn(cls: type[W], table: Any, length_m: float, seed: int) -> W:
+    """The wall or door of a table."""
+    values = {f.name: getattr(table, f.name) for f in fields(cls)}  # type: ignore[arg-type]
+    if values["magnetization"] is None:
+        look = MATERIALS[table.material] if table.material != NO_LEAF else ""
+        body = Part(BODY, (0, 0, 0), (length_m, table.thickness_m, table.height_m), look)
+        drawn = drawn_magnetization(table.name, [body], seed=seed)
+        values["magnetization"] = drawn[0] if drawn else 0.0
+    return cls(**values)
+
+
+def lab_with_walls(
+    lab: LabSpec,
+    walls: Sequence[Wall],
+    doors: Sequence[Door],
+    windows: Sequence[Window],
+    path: str | os.PathLike[str],
+    *,
+    seed: int,
+) -> LabSpec:
+    """As `with_walls`, of the tables of a TOML `path`.
+
+    Raises:
+        InputError: As there; the text has file and line.
+    """
+    if not (walls or doors or windows):
+        return lab
+    for section, number, key, text in Structure.named(walls, doors, windows, lab.sides).faults():
+        raise refused_at(path, key, text, section=section, number=number)
+    return with_walls(lab, walls, doors, windows, seed=seed)
+
+
+def check_not_in_walls(
+    pieces: Sequence[FurnitureSpec], lab: LabSpec, obstacles: Obstacles, path: str | os.PathLike[str]
+) -> None:
+    """Refuse furniture that stands in a wall or in the leaf of a door.
+
+    Args:
+        pieces: Furniture, in the order of its tables in `path`.
+        lab: The room.
+        obstacles: Those of the room and its furniture.
+        path: The TOML, for error messages.
+
+    Raises:
+        InputError: A piece does; the text has its line, the wall and the depth.
+    """
+    if not lab.walls:
+        return
+    placed = list(zip(obstacles.names, obstacles.outlines, strict=True))
+    own = {wall.name for wall in lab.walls}
+    walls = [(name, o) for name, o in placed if name.startswith(f"{WALLS}/") and name.split("/")[4] in own]
+    numbers = {piece.name: number for number, piece in enumerate(pieces)}
+    for name, outline in placed:
+        if not name.startswith(f"{FURNITURE}/"):
+            continue
+        piece = name.split("/")[3]
+        for wall_name, wall in walls:
+            if (deep := overlap_m(outline, wall)) > IN_WALL_M:
+                parts = wall_name.split("/")[4:]
+                what = f"door {parts[1]!r}" if parts[-1] == "leaf" else f"wall {parts[0]!r}"
+                x, y = outline.mean(axis=0)
+                text = (
+                    f"{piece!r} stands {deep:.2f} m deep in {what} at ({x:.2f}, {y:.2f}); move it, or end "
+                    "the wall there"
+                )
+                if piece not in numbers:
+                    raise InputError(f"{path}: {text}")
+                raise refused_at(path, "p_world", text, section="furniture", number=numbers[piece])
