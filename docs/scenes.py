@@ -89,8 +89,8 @@ A piece of furniture consists of parts. Its steel parts are magnetised along the
 
 ROBOT = """
 The tables below, `[robot.drive]` and so on, are for a robot from a URDF; see [urdf.md](urdf.md). An asset
-already has these values: a key replaces the asset's, and its sensors stay on their links. For several robots, write one `[[robot]]` with a `name` for each, and
-`[robot.drive]` below it.
+already has these values: a key replaces the asset's, and its sensors stay on their links. For several
+robots, write one `[[robot]]` with a `name` for each, and `[robot.drive]` below it.
 """
 
 PATHS = """

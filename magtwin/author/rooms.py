@@ -17,12 +17,12 @@ from magtwin.author.furniture import FurnitureTable, check_stands
 from magtwin.author.robot import RobotSettings
 from magtwin.author.room import check_name, lab_of
 from magtwin.author.scene import check_names, check_things
-from magtwin.author.scene_file import EarthTable
+from magtwin.author.scene_file import EarthTable, about
 from magtwin.author.tables import table_of, table_of_robot, toml_text
 from magtwin.author.walls import DoorTable, WallTable, lab_with_walls
 from magtwin.errors import InputError, hint
 from magtwin.files.file import existing
-from magtwin.files.outputs import output
+from magtwin.files.outputs import WORKSHOP, output, transaction
 from magtwin.files.settings import from_values, plain
 from magtwin.frames import quat_from_yaw
 from magtwin.report.summary import Summarized, Summary, listed
@@ -146,8 +146,8 @@ class Room(Summarized):
     `Room`: `open_twin`, `simulate`, `sweep`, `survey`, `author_scene`. It becomes a scene when first used
     (`scene`); without a map, its robot then surveys it.
 
-    Lengths are metres, angles radians unless a name ends in `_deg`, magnetization is in A/m. x and y run along
-    the floor, z points up. The origin is the middle of the floor, or the origin of its corners.
+    Lengths are metres, angles radians unless a name ends in `_deg`, magnetization is in A/m. x and y run
+    along the floor, z points up. The origin is the middle of the floor, or the origin of its corners.
     """
 
     table: Mapping[str, Any]
@@ -232,7 +232,7 @@ class Room(Summarized):
         values |= {"faces": faces, "scale": None if scale == 1.0 else scale}
         what = f"{kind} {values['name']!r}"
         table = from_values(FurnitureTable, values, what)
-        with _about(what):
+        with about(what):
             check_stands(table.spec(self.table["seed"]), self._lab())
         return self._adding("furniture", values)
 
@@ -395,8 +395,8 @@ class Room(Summarized):
             path: What it drives by default: the name of a path, or a CSV file.
             network: Weights that predict its disturbance.
             kind: What its magnetometer reads: "physical", "neural" or "map-only".
-            magnetometer: Of a URDF, its link and place as "LINK:x,y,z" [m]; or fields of `MagnetometerSpec` to
-                change, as a mapping or a spec.
+            magnetometer: Of a URDF, its link and place as "LINK:x,y,z" [m]; or fields of `MagnetometerSpec`
+                to change, as a mapping or a spec.
             **parts: Other parts to change: drive, battery, platform, imu, lidar, mocap, plant.
 
         Raises:
@@ -456,7 +456,7 @@ class Room(Summarized):
         """Its tables as a TOML has them: a single robot without a name of its own is `[robot]`."""
         robots = self.table.get("robot", ())
         if not robots:
-            raise InputError(f"room {self.table['name']!r} has no robot; add one: .robot(\"turtlebot4\")")
+            raise InputError(f'room {self.table["name"]!r} has no robot; add one: .robot("turtlebot4")')
         alone = len(robots) == 1 and robots[0]["name"] == Path(robots[0].get("asset", "")).stem
         alone = alone or (len(robots) == 1 and "urdf" in robots[0])
         single = {key: value for key, value in robots[0].items() if key != "name"}
@@ -497,7 +497,7 @@ class Room(Summarized):
             walls = self.table.get("wall", ())
             if not walls:
                 raise InputError(
-                    f"{section}: the room has no wall yet; add one before, or name a side: wall=\"south\""
+                    f'{section}: the room has no wall yet; add one before, or name a side: wall="south"'
                 )
             wall = walls[-1]["name"]
         values = {"name": self._free(section, section, first=0), **more, "wall": wall, "at_m": at_m}
@@ -517,7 +517,9 @@ class Room(Summarized):
     def _adding(self, section: str, values: Mapping[str, Any]) -> "Room":
         held = self.table.get(section, [])
         if any(each["name"] == values["name"] for each in held):
-            raise InputError(f"two things of [[{section}]] are called {values['name']!r}; give each its own name")
+            raise InputError(
+                f"two things of [[{section}]] are called {values['name']!r}; give each its own name"
+            )
         return self._with(**{section: [*held, plain(values)]})
 
     def _with(self, **tables: Any) -> "Room":
@@ -528,7 +530,7 @@ class Room(Summarized):
 
 def changed(scene: Scene, changes: Mapping[str, Any]) -> Scene:
     """A scene with other values; see `Scene.with_`."""
-    before = {piece: None for piece in scene.furniture}
+    before = dict.fromkeys(scene.furniture)
     for way, value in changes.items():
         if way == "map_layer":
             file = _map_file(value)
@@ -549,12 +551,16 @@ def _set(spec: Any, way: Sequence[str], value: Any, whole: str) -> Any:
     if isinstance(spec, tuple):
         named = [str(getattr(each, "name", "") or each.robot.name) for each in spec]
         if not any(fnmatch.fnmatchcase(each, name) for each in named):
-            raise InputError(f"{whole}: there is no {name!r}; {hint(name, named) if named else 'there is none'}")
+            raise InputError(
+                f"{whole}: there is no {name!r}; {hint(name, named) if named else 'there is none'}"
+            )
         chosen = [fnmatch.fnmatchcase(each, name) for each in named]
         if not rest and value is None:
             return tuple(each for each, out in zip(spec, chosen, strict=True) if not out)
         if not rest:
-            raise InputError(f"{whole} must be followed by a field, as in {whole}.p_world, or be None to remove it")
+            raise InputError(
+                f"{whole} must be followed by a field, as in {whole}.p_world, or be None to remove it"
+            )
         return tuple(
             _set(each, rest, value, whole) if this else each for each, this in zip(spec, chosen, strict=True)
         )
@@ -571,13 +577,26 @@ def _set(spec: Any, way: Sequence[str], value: Any, whole: str) -> Any:
             return spec.with_part(name, new)
         return replace(spec, **{name: new})
     except InputError as error:
-        raise InputError(str(error) if whole == name or whole in str(error) else f"{whole}: {error}") from error
+        raise InputError(
+            str(error) if whole == name or whole in str(error) else f"{whole}: {error}"
+        ) from error
 
 
 def written(tables: Mapping[str, Any], out: File | None, force: bool) -> str:
-    """Tables as the text of a TOML, which is also written to a file if one is given."""
-    text = toml_text(tables)
-    if out is not None:
+    """Tables as the text of a TOML, which is also written to a file if one is given.
+
+    A map in a temporary folder is then copied beside it.
+    """
+    if out is None:
+        return toml_text(tables)
+    layer = Path(str(tables.get("map", "")))
+    with transaction():
+        if layer.parent.name.startswith(WORKSHOP):
+            copy = Path(out).with_suffix(".map.usdc")
+            with output(copy, force=force) as aside:
+                aside.write_bytes(layer.read_bytes())
+            tables = {**tables, "map": copy.name}
+        text = toml_text(tables)
         with output(out, force=force) as aside:
             aside.write_text(text, encoding="utf-8")
     return text
@@ -600,16 +619,3 @@ def _place(at: Point) -> list[float]:
     if not isinstance(place, list) or len(place) != 3:
         raise InputError(f"at must be x and y, or x, y and z [m], got {at!r}", parameter="at")
     return place
-
-
-class _about:  # noqa: N801
-    """Errors in the block begin with what they are about."""
-
-    def __init__(self, what: str) -> None:
-        self.what = what
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        if isinstance(error, InputError):
-            raise InputError(f"{self.what}: {error}") from error

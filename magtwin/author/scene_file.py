@@ -32,7 +32,6 @@ from magtwin.usd.lab.earth import checked
 from magtwin.usd.layers import layer_sha256
 from magtwin.usd.robot import load_robot
 
-
 PARTS = ("drive", "battery", "platform", "magnetometer", "imu", "lidar", "mocap")
 """Tables below [robot] whose keys replace those of an asset one by one; [robot.plant] replaces all."""
 
@@ -66,7 +65,7 @@ class _RobotTable(RobotSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _EarthTable(EarthFieldSpec):
+class EarthTable(EarthFieldSpec):
     """The Earth's field, uniform over the room. By default computed from place and date with the IGRF-14, up
     to 2030.
     """
@@ -106,7 +105,7 @@ class SceneFile:
     wall: tuple[WallTable, ...] = ()
     door: tuple[DoorTable, ...] = ()
     window: tuple[Window, ...] = ()
-    earth: _EarthTable | None = None
+    earth: EarthTable | None = None
     survey: SurveySpec | None = None
     sources: _SourcesTable | None = None
     source: tuple[SourceSpec, ...] = ()
@@ -192,7 +191,7 @@ def scene_from_toml(
             f'{path}: names no map; add map = "FILE.usdc" to it, or give `map_layer=FILE.usdc`, or add an '
             f"[earth] table (latitude_deg, longitude_deg, height_m, date){more}, from which it is surveyed"
         )
-    with _about(f"{path}:"):
+    with about(f"{path}:"):
         check_names(sources, pieces)
     standing = obstacles_in(lab, pieces)
     check_not_in_walls(pieces[len(pieces) - len(given.furniture) :], lab, standing, path)
@@ -212,7 +211,7 @@ def scene_from_toml(
         robots.append(PlacedRobot(robot=made, start=start, path=drives))
         with _at(path, "start", **({"section": "robot", "number": number} if of_robot else {})):
             check_start(robots[-1], lab, standing)
-    with _about(f"{path}: [earth]"):
+    with about(f"{path}: [earth]"):
         earth = checked(EarthFieldSpec(**vars(given.earth))) if given.earth else None
     scene = Scene(
         name=given.name,
@@ -227,17 +226,17 @@ def scene_from_toml(
         path=robots[0].path,
         others=tuple(robots[1:]),
     )
-    with _about(f"{path}:"):
+    with about(f"{path}:"):
         check_things(scene)
     if layer is None and survey_of is not None:
-        with _about(f"{path}: cannot be surveyed:"):
+        with about(f"{path}: cannot be surveyed:"):
             surveyed = survey_of(scene, given.survey or SurveySpec(), given.seed, standing)
         scene = replace(scene, map_layer=surveyed, map_sha256=layer_sha256(surveyed))
     return scene
 
 
 @contextmanager
-def _about(start: str) -> Iterator[None]:
+def about(start: str) -> Iterator[None]:
     """Errors inside begin with what they are about."""
     try:
         yield
@@ -306,7 +305,7 @@ def _robot(
         if others := sorted({"conversion", *(() if named else ("name",))} & set(keys)):
             raise InputError(f"{where} {others[0]} goes with urdf; an asset has it already")
         robot = load_robot(asset_named(table.asset, keys["asset"], where))
-        with _about(where):
+        with about(where):
             robot = _changed(robot, table, keys)
     elif table.urdf is None or table.asset is not None:
         raise InputError(f'{where} needs asset = "FILE.usda" or urdf = "FILE.urdf", and not both')
@@ -319,7 +318,7 @@ def _robot(
         folder = Path(workshop) / table.name if named else Path(workshop)
         folder.mkdir(parents=True, exist_ok=True)
         asset = folder / f"{table.urdf.name.split('.')[0]}.usda"
-        with _about(where):
+        with about(where):
             build_robot(table.urdf, settings, asset)
         robot = load_robot(asset, own=True)
     return replace(robot, name=table.name) if named else robot
@@ -369,7 +368,7 @@ def _path(path: str, folder: Path, where: str) -> str | Path:
         return path
     file = (folder / path).resolve()
     named = not Path(path).suffix and not file.exists()
-    with _about(f"{where} path:"):
+    with about(f"{where} path:"):
         resolve_path(path if named else file)
     return path if named else file
 

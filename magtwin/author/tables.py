@@ -61,7 +61,7 @@ def table_of_scene(scene: Scene) -> Table:
     """A scene as the tables of a TOML: `scene_from_toml` makes the same scene of them."""
     table: Table = {"name": scene.name, "map": str(scene.map_layer.absolute())}
     alone = not scene.others and load_robot(scene.robot.asset).name == scene.robot.name
-    robots = [_table_of_robot(placed) for placed in scene.robots]
+    robots = [table_of_robot(placed) for placed in scene.robots]
     if alone:
         table["start"] = robots[0].pop("start")
         del robots[0]["name"]
@@ -75,10 +75,14 @@ def table_of_scene(scene: Scene) -> Table:
     if scene.earth is not None:
         table["earth"] = table_of(scene.earth)
     if scene.sources:
-        table["source"] = [table_of(source, leave={"size_m"} if source.faces else set()) for source in scene.sources]
+        table["source"] = [
+            table_of(source, leave={"size_m"} if source.faces else set()) for source in scene.sources
+        ]
     if scene.furniture:  # magnetization is given, or else it would be drawn
         pieces = [(piece, table_of(piece)) for piece in scene.furniture]
-        table["furniture"] = [{**given, "magnetization": list(piece.magnetization)} for piece, given in pieces]
+        table["furniture"] = [
+            {**given, "magnetization": list(piece.magnetization)} for piece, given in pieces
+        ]
     return table | {"robot": robots[0] if alone else robots}
 
 
@@ -106,7 +110,7 @@ def _value(value: Any) -> Any:
     return str(value.absolute()) if isinstance(value, Path) else value
 
 
-def _table_of_robot(placed: PlacedRobot) -> Table:
+def table_of_robot(placed: PlacedRobot) -> Table:
     """A robot as its asset, and what differs from it."""
     robot, asset = placed.robot, load_robot(placed.robot.asset)
     known = shipped("robots") / robot.asset.stem / robot.asset.name

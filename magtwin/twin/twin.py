@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 
@@ -21,6 +21,8 @@ from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import MagnetometerSpec
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer
     from magtwin.learn.models.predictor import Predictor
     from magtwin.learn.training.result import TrainingResult
@@ -34,6 +36,25 @@ Session = int | Literal["survey"]
 """Number of a session, or the robot as it was when the map was surveyed."""
 
 Metadata = dict[str, str | int | float | bool]
+
+
+class HasScene(Protocol):
+    """What can be made a scene, such as a `magtwin.Room`."""
+
+    @property
+    def scene(self) -> Scene:
+        """The scene."""
+
+
+class UsdStage(Protocol):
+    """An open stage, a `pxr.Usd.Stage`."""
+
+    def GetRootLayer(self) -> Any:  # noqa: N802
+        """Its root layer."""
+
+
+Place = Scene | HasScene | UsdStage | str | FilePath
+"""A scene: in memory, as a room, as a stage of pxr's, or as the file of a stage."""
 
 Network: TypeAlias = "str | FilePath | Predictor | TrainingResult | None"
 """Weights of a neural magnetometer: a file, a predictor, or what `magtwin.train` gives. None: the scene's."""
@@ -81,6 +102,10 @@ class Twin(Summarized):
     stage: object = dataclasses.field(default=None, repr=False, compare=False)
     """Keeps the temporary stage of a `Scene` alive. None if `scene_file` is a user's file."""
 
+    def plot(self) -> "Figure":
+        """Draw the room from above, over the map; see `magtwin.plot`."""
+        return importlib.import_module("magtwin").plot(self)  # type: ignore[no-any-return]
+
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "opened": None}  # an open stage stays in its process
 
@@ -94,10 +119,10 @@ class Twin(Summarized):
         plant = self.metadata.get("plant", OF_SCENE if robot.plant != PlantSpec() else "")
         sensor += f", plant {plant}" if plant else ""
         more = f", and {len(self.scene.others)} more robots" if self.scene.others else ""
-        width, depth = self.scene.lab.floor_m
+        x0, x1, y0, y1 = self.scene.lab.extent_m
         network = self.magnetometer._summary().title.partition(" ")[2] if self.magnetometer else "none"
         return Summary(
-            f"Twin {self.scene.name}: floor {width:g} x {depth:g} m, {len(self.obstacles)} obstacles",
+            f"Twin {self.scene.name}: floor {x1 - x0:g} x {y1 - y0:g} m, {len(self.obstacles)} obstacles",
             (
                 ("robot", sensor + more + (f", session {self.session['session']}" if self.session else "")),
                 ("map", field.title.partition(" ")[2]),
@@ -108,7 +133,7 @@ class Twin(Summarized):
 
 
 def opened(
-    twin: Twin | Scene | str | FilePath,
+    twin: Twin | Place,
     network: Network,
     magnetometer: Kind | None,
     model_error: bool,
