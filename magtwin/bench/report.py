@@ -7,31 +7,23 @@ from dataclasses import MISSING, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from magtwin.bench.leaderboard import Columns, Difference, Standing, compare_rows, standings
 from magtwin.bench.results import read_results
 from magtwin.bench.statistics import Interval, Paired
 from magtwin.bench.suite import Scenario
-from magtwin.figures.canvas import (
-    WIDTH_IN,
-    Picture,
-    label,
-    legend_below,
-    new_figure,
-    open_frame,
-    picture,
-)
-from magtwin.figures.evaluations import INKS
+from magtwin.figures.canvas import Chart, label, legend_above
 from magtwin.figures.page import Page, Section, Table, write_pages
+from magtwin.figures.style import INK, SERIES, SOFT
 from magtwin.files.outputs import check_free
 from magtwin.report.report import Report
 
 Array = NDArray[np.float64]
 
 LEAST_M, MOST_M = 0.01, 5.0  # Range of errors in figures [m]
-BOUND_INK = "0.35"
-
+Look = Mapping[str, Any]
 
 NAME = "bench"
 """Name of a report's files."""
@@ -123,13 +115,13 @@ def page_of_results(
     """
     all_of_them = standings(rows, times, compensated)
     names = list(dict.fromkeys(s.localizer for s in all_of_them))
-    inks = {name: INKS[k % len(INKS)] for k, name in enumerate(names)}
+    looks = {name: SERIES[k % len(SERIES)] for k, name in enumerate(names)}
     sections = [Section("Leaderboard", _lead(rows), (), (_overview(all_of_them),))]
     for scenario in dict.fromkeys(s.scenario for s in all_of_them):
         here = [s for s in all_of_them if s.scenario == scenario]
         mine = [t for t in tracks if t["scenario"] == scenario]
         causal = {s.localizer for s in here} - {*compensated, *rows["localizer"][rows["smoother"]].tolist()}
-        pictures = [_cdf(here, rows, inks), _over_time(here, mine, inks, causal)]
+        charts = [_cdf(here, rows, looks), _over_time(here, mine, looks, causal)]
         best = _best(here)
         tables = [_accuracy(here), _reliability(here)]
         if best is not None and len(here) > 1:
@@ -142,11 +134,37 @@ def page_of_results(
             Section(
                 scenario,
                 _described(scenarios[scenario], here, rows) if scenario in scenarios else "",
-                tuple(p for p in pictures if p is not None),
+                tuple(chart.picture() for chart in charts if chart is not None),
                 tuple(tables),
             )
         )
-    return Page(title, origin, tuple(sections), data={"standings": [_plain(s) for s in all_of_them]})
+    data = {"standings": [_plain(s) for s in all_of_them]}
+    verdict, figures = _verdict(all_of_them), _figures(rows, all_of_them)
+    return Page(title, origin, tuple(sections), data=data, verdict=verdict, figures=figures)
+
+
+def _verdict(every: Sequence[Standing]) -> str:
+    """The best localizer of each scenario, in a line each."""
+    lines = []
+    for scenario in dict.fromkeys(s.scenario for s in every):
+        best = _best([s for s in every if s.scenario == scenario])
+        if best is None or best.rmse_m is None:
+            lines.append(f"{scenario}: no localizer has a result.")
+            continue
+        least = f", {best.ratio:.2f} times its bound" if math.isfinite(best.ratio) else ""
+        lines.append(f"{scenario}: {best.localizer} is best, RMSE {_interval(best.rmse_m)} m{least}.")
+    return "\n".join(lines)
+
+
+def _figures(rows: Columns, every: Sequence[Standing]) -> list[tuple[str, str]]:
+    """The benchmark in five figures."""
+    return [
+        ("runs", f"{len(rows['run']):,}"),
+        ("failed", f"{np.count_nonzero(rows['status'] != 'ok'):,}"),
+        ("localizers", f"{len({s.localizer for s in every}):,}"),
+        ("scenarios", f"{len({s.scenario for s in every}):,}"),
+        ("sessions", f"{len(np.unique(rows['session'])):,}"),
+    ]
 
 
 def _described(scenario: Scenario, here: Sequence[Standing], rows: Columns) -> str:
@@ -301,78 +319,75 @@ def _failures(rows: Columns, scenario: str) -> Table | None:
     return Table("Failures", ("localizer", "runs", "reason"), tuple((k[0], n, k[1]) for k, n in found))
 
 
-def _cdf(here: Sequence[Standing], rows: Columns, inks: Mapping[str, str]) -> Picture | None:
-    figure = new_figure(WIDTH_IN / 2 + 0.6, 3.4)
-    ax = figure.subplots()
-    drawn = False
+def _cdf(here: Sequence[Standing], rows: Columns, looks: Mapping[str, Look]) -> Chart | None:
+    found = {}
     for s in here:
         mine = (rows["scenario"] == s.scenario) & (rows["localizer"] == s.localizer)
-        errors = np.sort(rows["rmse_m"][mine & (rows["status"] == "ok")])
-        if not len(errors):
-            continue
-        ax.step(
-            np.clip(np.append(errors[:1], errors), LEAST_M, MOST_M),
-            np.arange(len(errors) + 1) / s.runs,
-            where="post",
-            color=inks[s.localizer],
-            lw=1.4,
-            label=s.localizer,
-        )
-        if s.bound_m > 0:
-            ax.axvline(max(s.bound_m, LEAST_M), color=inks[s.localizer], lw=1, ls="--", zorder=1)
-        drawn = True
-    if not drawn:
+        found[s.localizer] = np.sort(rows["rmse_m"][mine & (rows["status"] == "ok")])
+    bounds = any(s.bound_m > 0 and len(found[s.localizer]) for s in here)
+
+    def draw(ax: Axes) -> None:
+        for s in here:
+            errors, look = found[s.localizer], looks[s.localizer]
+            if not len(errors):
+                continue
+            x = np.clip(np.append(errors[:1], errors), LEAST_M, MOST_M)
+            ax.step(x, np.arange(len(errors) + 1) / s.runs, where="post", **look, label=s.localizer)
+            if s.bound_m > 0:
+                ax.axvline(max(s.bound_m, LEAST_M), color=look["color"], lw=1, ls=":", zorder=1)
+        if bounds:
+            ax.plot([], [], color=SOFT, lw=1, ls=":", label="its bound")
+        ax.set_xscale("log")
+        _error_axis(ax.xaxis)
+        ax.set_ylim(0, 1.02)
+        label(ax, "RMSE of a run [m]", "share of runs")
+        legend_above(ax, 2)
+
+    if not any(map(len, found.values())):
         return None
-    if any(s.bound_m > 0 for s in here):
-        ax.plot([], [], color=BOUND_INK, lw=1, ls="--", label="its bound")
-    ax.set_xscale("log")
-    _error_axis(ax.xaxis)
-    ax.set_ylim(0, 1.02)
-    label(ax, "RMSE of a run [m]", "share of runs")
-    open_frame(ax)
-    legend_below(figure)
     scenario = here[0].scenario
-    text = f"{scenario}: share of runs below an RMSE, and the bound of each localizer's pooled RMSE (dashes)"
-    return picture(figure, text, file=f"{scenario}_cdf")
+    text = f"{scenario}: share of runs below an RMSE, and the bound of each localizer's pooled RMSE (dots)"
+    return Chart(text, draw, 3.0 + 0.1 * len(here), f"{scenario}_cdf")
 
 
 def _over_time(
     here: Sequence[Standing],
     tracks: Sequence[Mapping[str, Any]],
-    inks: Mapping[str, str],
+    looks: Mapping[str, Look],
     causal: Collection[str],
-) -> Picture | None:
+) -> Chart | None:
     """Errors over time; the bound is that of the localizers in `causal`, over all runs."""
     if not tracks:
         return None
-    figure = new_figure(WIDTH_IN / 2 + 0.6, 3.4)
-    ax = figure.subplots()
-    for s in here:
-        mine = [t for t in tracks if t["localizer"] == s.localizer]
-        errors = _stacked(mine, "error_m")
-        if errors is None or not np.isfinite(errors).any():
-            continue
-        t = max((m["t"] for m in mine), key=len)
-        ax.plot(t, _middle(errors, 50), color=inks[s.localizer], lw=1.4, label=s.localizer)
-        ax.plot(t, _middle(errors, 95), color=inks[s.localizer], lw=0.8, ls=":")
     runs = list({t["run"]: t for t in tracks if t["localizer"] in causal}.values())
     bound = _stacked(runs, "bound_m")
-    text = f"{here[0].scenario}: position error over time, median of runs (line) and 95th percentile (dots)"
-    if bound is not None and np.isfinite(bound).any():
-        t = max((run["t"] for run in runs), key=len)
-        line = np.sqrt(np.nanmean(bound**2, axis=0))
-        ax.plot(t, line, color=BOUND_INK, lw=1.2, ls="--", label="bound, RMS")
+    bounded = bound is not None and bool(np.isfinite(bound).any())
+
+    def draw(ax: Axes) -> None:
+        for s in here:
+            mine, look = [t for t in tracks if t["localizer"] == s.localizer], looks[s.localizer]
+            errors = _stacked(mine, "error_m")
+            if errors is None or not np.isfinite(errors).any():
+                continue
+            t = max((m["t"] for m in mine), key=len)
+            ax.plot(t, _middle(errors, 50), **look, label=s.localizer)
+            ax.plot(t, _middle(errors, 95), **look, lw=0.7, alpha=0.6)
+        if bound is not None and bounded:
+            t = max((run["t"] for run in runs), key=len)
+            ax.plot(t, np.sqrt(np.nanmean(bound**2, axis=0)), color=INK, lw=1.2, ls=":", label="bound, RMS")
+        ax.set_yscale("log")
+        ax.set_ylim(LEAST_M, MOST_M)
+        _error_axis(ax.yaxis)
+        label(ax, "time [s]", "position error [m]")
+        legend_above(ax, 2)
+
+    text = f"{here[0].scenario}: position error over time, median of runs and 95th percentile (thin)"
+    if bounded:
         text += (
-            "; bound of the RMS of causal methods without a compensator (dashes): a median of 0.83 of it "
+            "; bound of the RMS of causal methods without a compensator (dots): a median of 0.83 of it "
             "reaches it"
         )
-    ax.set_yscale("log")
-    ax.set_ylim(LEAST_M, MOST_M)
-    _error_axis(ax.yaxis)
-    label(ax, "time [s]", "position error [m]")
-    open_frame(ax)
-    legend_below(figure)
-    return picture(figure, text, file=f"{here[0].scenario}_time")
+    return Chart(text, draw, 3.0 + 0.1 * len(here), f"{here[0].scenario}_time")
 
 
 def _stacked(tracks: Sequence[Mapping[str, Any]], name: str) -> Array | None:

@@ -5,12 +5,12 @@ A figure is drawn without pyplot and without a window system. The same input giv
 
 import io
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -18,9 +18,11 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from matplotlib.ticker import StrMethodFormatter
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
+from magtwin.figures.style import FAINT, LIDAR, styled
 from magtwin.files.outputs import output
 from magtwin.report.summary import printable_lines
 from magtwin.run.thinning import newest
@@ -28,9 +30,9 @@ from magtwin.run.thinning import newest
 Array = NDArray[np.float64]
 
 SUFFIXES = (".png", ".svg")
-DPI, PAGE_DPI = 110, 160
+DPI, PAGE_DPI = 110, 200
 
-WIDTH_IN = 5.2
+WIDTH_IN = 4.4
 """Width of a picture on a page [inch]: narrow, so that its text stays readable on a phone and on paper."""
 
 POINTS = 1200
@@ -41,9 +43,6 @@ SEGMENTS = 3000
 
 LONGEST_NAME = 28
 """Characters of a name in a legend or caption."""
-
-INK, MAP_INK, OTHER_INK, MEASURED_INK = "#1f2430", "#e08214", "#1971c2", "0.62"
-LIDAR_INK, PLAN_INK = "#d9e6f2", "#d6336c"
 
 
 @dataclass(frozen=True)
@@ -68,9 +67,10 @@ class Picture:
     """Name of its file beside a page, without the suffix. Default: picture_0 and so on."""
 
 
+@styled
 def new_figure(width_in: float, height_in: float) -> Figure:
     """An empty figure on its own canvas."""
-    return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained", facecolor="white")
+    return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
 
 
 def picture(figure: Figure, title: str, *, alt: str = "", file: str = "", kind: str = "svg") -> Picture:
@@ -78,6 +78,26 @@ def picture(figure: Figure, title: str, *, alt: str = "", file: str = "", kind: 
     figure.set_dpi(PAGE_DPI)
     width, height = figure.get_size_inches()
     return Picture(title, alt or title, kind, render(figure, f".{kind}"), width / height, file)
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A drawing on axes of its own: alone on a page, or one of several in a figure."""
+
+    title: str
+    draw: Callable[[Axes], None]
+    height_in: float = 2.7
+    """Height on a page [inch]."""
+
+    file: str = ""
+    """Name of its file beside a page, without the suffix."""
+
+    @styled
+    def picture(self) -> Picture:
+        """The chart alone, with its title as the caption."""
+        figure = new_figure(WIDTH_IN, self.height_in)
+        self.draw(figure.subplots())
+        return picture(figure, self.title, file=self.file)
 
 
 def save(figure: Figure, out: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -94,15 +114,15 @@ def save(figure: Figure, out: str | os.PathLike[str], *, force: bool = False) ->
         path.write_bytes(data)
 
 
+@styled
 def render(figure: Figure, suffix: str) -> bytes:
     """A figure as the bytes of a .png or .svg file, without date and version."""
     file = io.BytesIO()
     plain_text(figure)
     if suffix == ".png":
         FigureCanvasAgg(figure).print_png(file, metadata={"Software": None})
-    else:  # a fixed salt for the names of its parts; text stays text
-        with rc_context({"svg.hashsalt": "magtwin", "svg.fonttype": "none"}):
-            FigureCanvasSVG(figure).print_svg(file, metadata={"Date": None, "Creator": None})
+    else:
+        FigureCanvasSVG(figure).print_svg(file, metadata={"Date": None, "Creator": None})
     return file.getvalue()
 
 
@@ -116,38 +136,34 @@ def plain_text(figure: Figure) -> None:
 
 
 def label(ax: Axes, x: str = "", y: str = "", *, title: str = "") -> None:
-    """Axis labels with units, and a title at the left, in the shared text size."""
-    ax.tick_params(labelsize=9)
-    if x:
-        ax.set_xlabel(x, fontsize=9)
-    if y:
-        ax.set_ylabel(y, fontsize=9)
+    """Axis labels with units, and a title at the left; thousands of nT are told apart by commas."""
+    for axis, text in ((ax.xaxis, x), (ax.yaxis, y)):
+        if text:
+            axis.set_label_text(text)
+        if "[nT" in text:
+            axis.set_major_formatter(StrMethodFormatter("{x:,.6g}"))
     if title:
-        ax.set_title(title, fontsize=9, loc="left")
+        ax.set_title(title)
 
 
-def open_frame(ax: Axes) -> None:
-    """Remove the upper and the right edge of the frame."""
-    ax.spines[["top", "right"]].set_visible(False)
+def legend_above(ax: Axes, columns: int = 4, **options: Any) -> None:
+    """A legend above the axes, if any line has a name, in two columns on a page."""
+    columns = columns if ax.get_figure(root=True).get_figwidth() > WIDTH_IN else min(columns, 2)
+    if options or ax.get_legend_handles_labels()[0]:
+        ax.legend(ncols=columns, loc="lower left", bbox_to_anchor=(0, 1), **options)
 
 
-def legend_above(ax: Axes, columns: int = 1) -> None:
-    """A legend above the axes, if any line has a name."""
-    if ax.get_legend_handles_labels()[0]:
-        place = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0}
-        ax.legend(ncols=columns, fontsize=9, frameon=False, **place)
-
-
-def legend_below(figure: Figure, *entries: Any) -> None:
-    """A legend in two columns below the whole figure."""
-    figure.legend(*entries, loc="outside lower center", ncols=2, fontsize=9, frameon=False)
+def legend_below(figure: Figure, *entries: Any, columns: int = 2) -> None:
+    """A legend below the whole figure."""
+    figure.legend(*entries, loc="outside lower center", ncols=columns)
 
 
 def colour_bar(figure: Any, drawn: ScalarMappable, axes: Any, title: str, **options: Any) -> None:
-    """A colour bar with a title; `options` are those of `Figure.colorbar`."""
-    bar = figure.colorbar(drawn, ax=axes, **{"shrink": 0.9, "pad": 0.02, **options})
-    bar.set_label(title, fontsize=9)
-    bar.ax.tick_params(labelsize=8)
+    """A colour bar with a title, to the right or, with `below`, under the axes."""
+    below = {"orientation": "horizontal", "aspect": 36} if options.pop("below", False) else {}
+    bar = figure.colorbar(drawn, ax=axes, **{"shrink": 0.9, "pad": 0.02, **below, **options})
+    bar.outline.set_visible(False)
+    label(bar.ax, **({"x": title} if below else {"y": title}))
 
 
 def evenly(size: int, count: int) -> NDArray[np.intp]:
@@ -157,7 +173,7 @@ def evenly(size: int, count: int) -> NDArray[np.intp]:
 
 def draw_line(ax: Axes, t: Array, values: Array, **look: Any) -> None:
     """Draw a line, thinned to what can be seen."""
-    ax.plot(*thinned(t, values), **{"lw": 0.9, **look})
+    ax.plot(*thinned(t, values), **look)
 
 
 def coloured_line(
@@ -183,16 +199,23 @@ def coloured_line(
         lw=width,
         capstyle="round",
         zorder=3,
+        rasterized=True,
     )
     ax.add_collection(line)
     return line
 
 
-def shade(ax: Axes, t: Array, on: NDArray[np.bool_]) -> None:
-    """Shade the spans of time in which a flag is set."""
+def shade(ax: Axes, t: Array, on: NDArray[np.bool_], *, colour: str = LIDAR, name: str = "_") -> None:
+    """Shade the spans of time in which a flag is set, the first of them with a name for the legend."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int)))
-    for first, last in edges.reshape(-1, 2):
-        ax.axvspan(t[first], t[min(last, len(t) - 1)], color=LIDAR_INK, lw=0, zorder=-1)
+    for k, (first, last) in enumerate(edges.reshape(-1, 2)):
+        end = t[min(last, len(t) - 1)]
+        ax.axvspan(t[first], end, color=colour, lw=0, zorder=-1, label="_" if k else name)
+
+
+def zero_line(ax: Axes) -> None:
+    """A thin line at zero."""
+    ax.axhline(0, color=FAINT, lw=0.7, zorder=0)
 
 
 def thinned(t: Array, values: Array, points: int = POINTS) -> tuple[Array, Array]:

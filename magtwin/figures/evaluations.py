@@ -1,26 +1,30 @@
 """Evaluations: models against recordings as one report, with Table 1 and the figures of the paper."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from magtwin.figures.canvas import (
-    INK,
     WIDTH_IN,
+    Chart,
     Picture,
     colour_bar,
     coloured_line,
     draw_line,
     evenly,
     label,
-    legend_below,
+    legend_above,
     new_figure,
     picture,
     short_name,
+    zero_line,
 )
-from magtwin.figures.maps import mean_field_ut
+from magtwin.figures.maps import draw_mean
 from magtwin.figures.page import Page, Section, Table
 from magtwin.figures.reports import section_of_traversals
+from magtwin.figures.style import FAINT, INK, SERIES, SIGNED_COLOURS, styled
 from magtwin.figures.training import draw_correlations
 from magtwin.learn.data.correlation import correlations
 from magtwin.learn.data.features import FEATURES, FULL, features
@@ -35,12 +39,6 @@ NAME = "evaluation"
 
 MOST_COLUMNS = 12
 """Columns of a table. One with more paths is transposed."""
-
-INKS = (
-    *("0.55", "#1971c2", "#e08214", "#2f9e44", "#9c36b5", "#d6336c", "#0c8599", "#5c4813"),
-    *("#74c0fc", "#ffc078", "#8ce99a", "#e599f7", "#faa2c1", "#66d9e8", "#c5a880"),
-)
-"""Colours of the models, that of the naive one first."""
 
 MOST_PANELS = 6
 """Models or paths in one figure."""
@@ -67,32 +65,38 @@ def page_of_evaluation(
     """
     every = evaluation.every
     against = "the exact field" if evaluation.truth else "the reading"
-    lead = (
-        f"{len(evaluation.judged)} recordings of {every.sessions} sessions, {every.scores[0].rows:,} "
-        "readings on which every model was evaluated. Errors: total field at the sensor, predicted minus "
-        f"{against}."
-    )
     verdicts = [f"{name}: {line}" for name, line in evaluation.verdicts().items()]
+    best = every.scores[_best(evaluation)]
+    figures = [
+        ("recordings", f"{len(evaluation.judged)} of {every.sessions} sessions"),
+        ("readings", f"{best.rows:,}"),
+        (f"mean error, {short_name(evaluation.names[_best(evaluation)])}", f"{best.mae_nt:,.1f} nT"),
+        (f"mean error, {short_name(evaluation.names[0])}", f"{every.scores[0].mae_nt:,.1f} nT"),
+        ("ratio", f"{best.ratio:.3f} ({best.ratio_interval[0]:.3f} to {best.ratio_interval[1]:.3f})"),
+    ]
+    lead = f"Errors: total field at the sensor, predicted minus {against}; all models on the same readings."
     lost = tuple(evaluation.left_out.items())
     note = "All models are evaluated on the same readings." if lost else "None."
-    left_out = Table("Readings left out", ("reason", "readings"), lost, note)
-    tables = (_models(evaluation), _maps(evaluation), left_out)
-    a_run, correlated = (_time_series(evaluation), _floor_plan(evaluation)), _rank_correlations(evaluation)
+    left_out = Table("Readings left out", ("reason", "readings"), lost, note, folded=True)
+    charts = [_path_errors(evaluation), *_time_series(evaluation)]
+    pictures = [
+        *(chart.picture() for chart in charts),
+        *_floor_plan(evaluation),
+        *_rank_correlations(evaluation),
+    ]
     sections = (
+        Section("Errors", "", tuple(pictures)),
         Section("Table 1", _lead_of_table(evaluation), (), (_table(evaluation),)),
-        Section("Models and maps", "", (), tables),
-        Section("Inputs and the disturbance", "", () if correlated is None else (correlated,)),
-        Section("A run", "", a_run),
-        Section("Errors by path", "", (_path_errors(evaluation),)),
         *([_budgets(budgets)] if budgets else []),
         *([section_of_traversals(*both)] if both else []),
-        Section("Every score", "", (), (_intervals(evaluation),)),
+        Section(
+            "Details", "", (), (_intervals(evaluation), _models(evaluation), _maps(evaluation), left_out)
+        ),
     )
-    sections = tuple(section for section in sections if section.tables or section.pictures)
     data = evaluation.summary()
     data |= {"budget": {"models": [budget.summary() for budget in budgets]}} if budgets else {}
     data |= {"traversals": both[0].summary()} if both else {}
-    return Page("Evaluation", " ".join([*verdicts, lead]), sections, data=data)
+    return Page("Evaluation", lead, sections, data=data, verdict="\n".join(verdicts), figures=figures)
 
 
 def _lead_of_table(evaluation: Evaluation) -> str:
@@ -152,7 +156,9 @@ def _intervals(evaluation: Evaluation) -> Table:
         f"from, to: {LEVEL:.0%} interval. coverage: share of the readings within the predicted "
         f"{COVERED:.0%} interval. out of distribution: share with an input outside the training ranges."
     )
-    return Table("With intervals", (*head, "coverage", "out of distribution"), rows, note)
+    return Table(
+        "Every score, with intervals", (*head, "coverage", "out of distribution"), rows, note, folded=True
+    )
 
 
 def _budgets(budgets: Sequence[Budget]) -> Section:
@@ -178,7 +184,8 @@ def _models(evaluation: Evaluation) -> Table:
         )
         for one in evaluation.candidates
     )
-    return Table("Models", ("model", "map", "inputs", "lever arm [mm]", "latency [ms]", "SHA-256"), rows)
+    head = ("model", "map", "inputs", "lever arm [mm]", "latency [ms]", "SHA-256")
+    return Table("Models", head, rows, folded=True)
 
 
 def _maps(evaluation: Evaluation) -> Table:
@@ -196,12 +203,12 @@ def _maps(evaluation: Evaluation) -> Table:
         "expected: the map's error on these readings, according to its own variances; the noise floor of its "
         "labels. map alone: the map without a model of the robot, before and after its mean error is removed."
     )
-    return Table("Maps", (*head, "less its mean [nT]"), tuple(rows), note)
+    return Table("Maps", (*head, "less its mean [nT]"), tuple(rows), note, folded=True)
 
 
-def _ink(m: int) -> str:
-    """Colour of a model by its index."""
-    return INKS[m % len(INKS)]
+def _look(m: int) -> dict[str, Any]:
+    """Colour and dashes of a model by its index; the naive one is grey."""
+    return SERIES[(m - 1) % len(SERIES)] if m else {"color": FAINT, "ls": "-"}
 
 
 def _trained(evaluation: Evaluation) -> list[int]:
@@ -215,12 +222,12 @@ def _best(evaluation: Evaluation) -> int:
     return min(_trained(evaluation), key=lambda m: evaluation.every.scores[m].mae_nt)
 
 
-def _rank_correlations(evaluation: Evaluation) -> Picture | None:
+def _rank_correlations(evaluation: Evaluation) -> tuple[Picture, ...]:
     """Figure 2: correlation of each input with the disturbance, on the first map."""
     judged = evaluation.judged
     able = [name for name in FULL if all(one.run.keys() >= set(FEATURES[name].columns) for one in judged)]
     if not able:
-        return None
+        return ()
     sessions = list(dict.fromkeys(one.session for one in judged))
     xs, ys, groups = [], [], []
     for one in judged:
@@ -233,46 +240,56 @@ def _rank_correlations(evaluation: Evaluation) -> Picture | None:
         groups.append(np.full(int(known.sum()), sessions.index(one.session)))
     x, y = np.concatenate(xs), np.concatenate(ys)
     if len(y) < 3 or not np.ptp(y):
-        return None
+        return ()
     title = "Figure 2: Spearman's correlation of each input with the disturbance, beside the paper's"
     figure = draw_correlations(correlations(x, y, able, np.concatenate(groups)))
-    return picture(figure, title, file="figure_2")
+    return (picture(figure, title, file="figure_2"),)
 
 
-def _time_series(evaluation: Evaluation) -> Picture:
-    """Figure 5: field as measured, by the map alone and by each model, and the errors with their interval."""
-    one, shown = _middle(evaluation), _trained(evaluation)
+def _time_series(evaluation: Evaluation) -> list[Chart]:
+    """Figure 5: field as measured and by the map alone, and the errors of each model with their interval."""
+    one = _middle(evaluation)
     t = one.run["t"] - one.run["t"][0]
     seen = t <= SHOWN_S
     t, kept = t[seen], one.kept[seen]
-    measured, rows = np.where(kept, one.measured_nt[seen], np.nan), evenly(len(t), 900)
-    figure = new_figure(WIDTH_IN, 0.9 + 2.6 * len(shown))
-    heights = [1.5, 1.0] * len(shown)
-    axes = figure.subplots(2 * len(shown), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
-    for k, m in enumerate(shown):
-        above, below = axes[2 * k : 2 * k + 2]
-        total, alone = (np.where(kept, values[m, seen], np.nan) for values in (one.total_nt, one.map_nt))
-        half, error = Z_90 * one.sd_nt[m, seen], total - measured
-        draw_line(above, t, measured / 1000, color=INK, lw=1.8, label="measured")
-        draw_line(above, t, alone / 1000, color="0.55", lw=1.0, label="map alone")
-        draw_line(above, t, total / 1000, color=_ink(m), lw=1.0, label="map and model")
-        if np.isfinite(half).any():
-            band = {"color": _ink(m), "alpha": 0.18, "lw": 0, "label": f"its {COVERED:.0%} interval"}
-            below.fill_between(t[rows], -half[rows], half[rows], **band)
-        draw_line(below, t, alone - measured, color="0.55", lw=0.8)
-        draw_line(below, t, error, color=_ink(m))
-        below.axhline(0, color=INK, lw=0.6)
-        mae = np.nanmean(np.abs(error)) if np.isfinite(error).any() else np.nan
-        title = f"{short_name(evaluation.names[m], 40)}: MAE {mae:.0f} nT"
-        label(above, y="field [µT]", title=title)
-        label(below, y="error [nT]")
-        above.margins(x=0)
-        below.margins(x=0)
-    label(axes[-1], "time [s]")
-    lines = {name: line for ax in axes for line, name in zip(*ax.get_legend_handles_labels(), strict=True)}
-    legend_below(figure, lines.values(), lines.keys())
-    title = f"Figure 5: total field of {one.name} ({one.path}), measured and predicted, and the errors"
-    return picture(figure, title, file="figure_5")
+    measured, alone = (np.where(kept, values[seen], np.nan) for values in (one.measured_nt, one.map_nt[0]))
+    rows, where = evenly(len(t), 900), f"{one.name} ({one.path})"
+
+    def field(ax: Axes) -> None:
+        draw_line(ax, t, measured, **SERIES[0], label="measured")
+        draw_line(ax, t, alone, **SERIES[1], label="map alone")
+        finish(ax, "total field [nT]")
+
+    def errors(m: int) -> Callable[[Axes], None]:
+        error = np.where(kept, one.total_nt[m, seen], np.nan) - measured
+        lacks = np.where(kept, one.map_nt[m, seen], np.nan) - measured
+        half = Z_90 * one.sd_nt[m, seen][rows]
+
+        def draw(ax: Axes) -> None:
+            draw_line(ax, t, lacks, color=FAINT, label="map alone")
+            draw_line(ax, t, error, **_look(m), label="map and model")
+            if np.isfinite(half).any():
+                band = {"color": _look(m)["color"], "alpha": 0.2, "lw": 0}
+                ax.fill_between(t[rows], -half, half, label=f"its {COVERED:.0%} interval", **band)
+            zero_line(ax)
+            finish(ax, "error [nT]")
+
+        return draw
+
+    def finish(ax: Axes, y: str) -> None:
+        ax.margins(x=0)
+        label(ax, "time [s]", y)
+        legend_above(ax, 2)
+
+    charts = [Chart(f"Figure 5: total field of {where}", field, file="figure_5_field")]
+    for m in _trained(evaluation):
+        off = np.abs(one.total_nt[m, seen] - one.measured_nt[seen])[kept]
+        mae = np.nanmean(off) if np.isfinite(off).any() else np.nan
+        title = (
+            f"Figure 5: errors of {short_name(evaluation.names[m], 40)} on {where}: mean size {mae:.0f} nT"
+        )
+        charts.append(Chart(title, errors(m), file=f"figure_5_{m}"))
+    return charts
 
 
 def _middle(evaluation: Evaluation) -> Judged:
@@ -282,61 +299,52 @@ def _middle(evaluation: Evaluation) -> Judged:
     return evaluation.judged[int(np.argsort(size, kind="stable")[(len(size) - 1) // 2])]
 
 
-def _floor_plan(evaluation: Evaluation) -> Picture:
-    """Figure 7: paths over the map, coloured by the field and by the error of the best model."""
+@styled
+def _floor_plan(evaluation: Evaluation) -> list[Picture]:
+    """Figure 7: paths over the map, coloured by the error of the best model."""
     cases = list(dict.fromkeys(one.case for one in evaluation.judged))[:MOST_PANELS]
     shown = [next(one for one in evaluation.judged if one.case == case) for case in cases]
     best = _best(evaluation)
     named = evaluation.candidates[best].map
     x0, x1, y0, y1 = named.field.extent
-    height = np.clip(2.2 * (y1 - y0) / (x1 - x0), 0.9, 5.0)
-    figure = new_figure(WIDTH_IN, 1.0 + (height + 0.35) * len(shown))
-    axes = figure.subplots(len(shown), 2, sharex=True, sharey=True, squeeze=False)
-    fields = [np.where(one.kept, one.measured_nt, np.nan) / 1000 for one in shown]
-    sizes = [np.where(one.kept, np.abs(one.total_nt[best] - one.measured_nt), np.nan) for one in shown]
-    error = f"|error| of {short_name(evaluation.names[best], 16)} [nT]"
-    for column, values, colours, text in (
-        (0, fields, "viridis", "total field [µT]"),
-        (1, sizes, "magma_r", error),
-    ):
-        low, high = np.nanquantile(np.concatenate(values), [0.01, 0.99])
-        for ax, one, value in zip(axes[:, column], shown, values, strict=True):
-            known, place = mean_field_ut(named.field), np.isfinite(one.p_xy).all(axis=1)
-            ax.pcolormesh(
-                named.field.x_m, named.field.y_m, known, shading="nearest", cmap="Greys", alpha=0.35
-            )
-            limits = (0.0 if column else low, high)
-            line = coloured_line(ax, one.p_xy[place], value[place], limits, colours, 2.2)
-            ax.set_aspect("equal")
-            label(ax)
-            ax.set_title(one.case if one.case == one.path else f"{one.case} ({one.path})", fontsize=9)
-        flat = {"orientation": "horizontal", "aspect": 30, "shrink": 1.0}
-        colour_bar(figure, line, axes[:, column].tolist(), text, **flat)
-        label(axes[-1, column], "x [m]")
-    for ax in axes[:, 0]:
-        label(ax, y="y [m]")
-    title = f"Figure 7: paths over the map {named.name} (grey, mean over headings)"
-    return picture(figure, title, file="figure_7", kind="png")
+    height = float(np.clip((WIDTH_IN - 0.8) * (y1 - y0) / (x1 - x0), 1.2, 6.0))
+    errors = [np.where(one.kept, one.total_nt[best] - one.measured_nt, np.nan) for one in shown]
+    reach = float(np.nanquantile(np.abs(np.concatenate(errors)), 0.99))
+    pictures = []
+    for k, (one, error) in enumerate(zip(shown, errors, strict=True)):
+        figure = new_figure(WIDTH_IN, height + 1.9)
+        ax, place = figure.subplots(), np.isfinite(one.p_xy).all(axis=1)
+        draw_mean(ax, named.field)
+        line = coloured_line(ax, one.p_xy[place], error[place], (-reach, reach), SIGNED_COLOURS, 2.6)
+        colour_bar(figure, line, ax, "error [nT]", below=True, extend="both")
+        label(ax, "x [m]", "y [m]")
+        case = one.case if one.case == one.path else f"{one.case} ({one.path})"
+        title = f"Figure 7: {case}, error of {short_name(evaluation.names[best])} over the map {named.name}"
+        pictures.append(picture(figure, title, file=f"figure_7_{k}"))
+    return pictures
 
 
-def _path_errors(evaluation: Evaluation) -> Picture:
+def _path_errors(evaluation: Evaluation) -> Chart:
     """Figure 6 a and b: errors by path, with their intervals."""
     cases = [case for case in evaluation.cases if case.name != "all"]
     count = len(evaluation.candidates)
-    figure = new_figure(WIDTH_IN, 2.9 + 0.13 * count)
-    ax = figure.subplots()
     width = 0.84 / count
-    for m, name in enumerate(evaluation.names):
-        at = np.arange(len(cases)) + (m - (count - 1) / 2) * width
-        mae = np.array([case.scores[m].mae_nt for case in cases])
-        low, high = np.array([case.scores[m].mae_interval_nt for case in cases]).T
-        ax.bar(at, mae, 0.92 * width, color=_ink(m), label=name)
-        spread = np.nan_to_num(np.stack([mae - low, high - mae]).clip(0))
-        ax.errorbar(at, mae, yerr=spread, fmt="none", ecolor=INK, elinewidth=0.8, capsize=1.5)
-    ax.set_xticks(np.arange(len(cases)), [case.name for case in cases], fontsize=9)
-    ax.set_ylim(bottom=0)
-    label(ax, y="mean absolute error [nT]")
-    ax.grid(axis="y", color="0.9")
-    ax.set_axisbelow(True)
-    legend_below(figure)
-    return picture(figure, f"Figure 6 a, b: errors by path, with {LEVEL:.0%} intervals", file="figure_6ab")
+
+    def draw(ax: Axes) -> None:
+        for m, name in enumerate(evaluation.names):
+            at = np.arange(len(cases)) + (m - (count - 1) / 2) * width
+            mae = np.array([case.scores[m].mae_nt for case in cases])
+            low, high = np.array([case.scores[m].mae_interval_nt for case in cases]).T
+            hatch = ("", "//", "..")[(m - 1) // 7 % 3] if m else ""
+            ax.bar(at, mae, 0.92 * width, color=_look(m)["color"], hatch=hatch, label=short_name(name))
+            spread = np.nan_to_num(np.stack([mae - low, high - mae]).clip(0))
+            ax.errorbar(at, mae, yerr=spread, fmt="none", ecolor=INK, elinewidth=0.8, capsize=1.5)
+        ax.set_xticks(np.arange(len(cases)), [short_name(case.name, 12) for case in cases])
+        ax.set_ylim(bottom=0)
+        label(ax, y="mean absolute error [nT]")
+        ax.grid(axis="y")
+        legend_above(ax, 1 if max(map(len, evaluation.names)) > 18 else 2)
+
+    rows = count if max(map(len, evaluation.names)) > 18 else -(-count // 2)
+    title = f"Figure 6 a, b: errors by path, with {LEVEL:.0%} intervals"
+    return Chart(title, draw, 2.6 + 0.19 * rows, "figure_6ab")

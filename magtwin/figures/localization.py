@@ -1,15 +1,14 @@
-"""Localization: the estimated path over the map, and its errors against time beside the bound."""
+"""Localization: the estimated path over the map, its errors against time beside the bound, and its page."""
 
 import math
 import os
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec
 from matplotlib.lines import Line2D
@@ -19,27 +18,31 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
+from magtwin.figures import canvas
 from magtwin.figures.canvas import (
-    INK,
     Array,
-    colour_bar,
+    Chart,
     draw_line,
     evenly,
     label,
+    legend_above,
     new_figure,
-    open_frame,
     save,
+    shade,
     short_name,
 )
-from magtwin.figures.maps import draw_cells, mean_field_ut
+from magtwin.figures.maps import draw_mean
+from magtwin.figures.page import Page, to_html
+from magtwin.figures.reports import page_of_report
+from magtwin.figures.style import BOUND, DATA, INK, LOST, MODEL, PAPER, styled
 from magtwin.files.outputs import output
 from magtwin.frames import quat_from_yaw, wrap_angle
 from magtwin.io.rerun.localization import write_localization
 from magtwin.tasks.localizing import Localization, truth_name
 
-ESTIMATE_INK, TRUTH_INK, DEAD_INK, BOUND_INK, LOST_INK = "#e8590c", INK, "#1971c2", "#2b8a3e", "#f3d9fa"
-BAND_INK = "#ffd8a8"
+DEAD_LOOK = {"color": DATA, "ls": (0, (4, 2))}
+BOUND_LOOK = {"color": BOUND, "ls": (0, (1.5, 1.2)), "lw": 1.7}
+BAND_LOOK = {"color": MODEL, "alpha": 0.22, "lw": 0}
 
 ELLIPSE_S = 5.0
 """Least time between ellipses [s]."""
@@ -55,6 +58,7 @@ TITLE_WIDTH = 105
 """Most characters of a line of the title."""
 
 
+@styled
 def draw_localization(result: Localization) -> Figure:
     """Draw a localization: paths over the map, and errors against time with the bound.
 
@@ -83,15 +87,43 @@ def draw_localization(result: Localization) -> Figure:
     figure.set_layout_engine("constrained", h_pad=0.1)
     grid = GridSpec(3, 1, figure, height_ratios=[tall + 0.5, 2.3, 1.4])
     top, position, heading = (figure.add_subplot(grid[k]) for k in range(3))
-    _draw_floor(figure, top, result, field)
+    _draw_floor(top, result, field)
     top.set(xlim=(x0, x1), ylim=(y0, y1))
     _draw_position(position, result)
     _draw_heading(heading, result)
     heading.sharex(position)
     label(heading, "time [s]")
     position.tick_params(labelbottom=False)
-    figure.suptitle(_title(result), fontsize=11)
+    figure.suptitle(_title(result), x=0.01, ha="left")
     return figure
+
+
+def page_of_localization(result: Localization) -> Page:
+    """A localization as a page: the verdict, its figures, the path and the errors."""
+    belief = result.problem.belief
+    field = belief if isinstance(belief, AnomalyMap) else None
+    x0, x1, y0, y1 = _extent(result, field)
+    tall = float(np.clip((canvas.WIDTH_IN - 0.8) * (y1 - y0) / (x1 - x0), 1.5, 6.0))
+
+    def floor(ax: Axes) -> None:
+        _draw_floor(ax, result, field)
+        ax.set(xlim=(x0, x1), ylim=(y0, y1))
+
+    def position(ax: Axes) -> None:
+        _draw_position(ax, result)
+        label(ax, "time [s]")
+
+    def heading(ax: Axes) -> None:
+        _draw_heading(ax, result)
+        label(ax, "time [s]")
+
+    charts = (
+        Chart("The estimated path over the map", floor, tall + 2.0, "path"),
+        Chart("Error of the position, and the bound of any method", position, 3.4, "position"),
+        Chart("Error of the heading, and its bound", heading, 2.6, "heading"),
+    )
+    lead = _title(result).partition("\n")[0]
+    return page_of_report(result.report(), "Localization", f"{lead}.", charts)
 
 
 def _extent(result: Localization, field: AnomalyMap | None) -> tuple[float, float, float, float]:
@@ -107,41 +139,35 @@ def _extent(result: Localization, field: AnomalyMap | None) -> tuple[float, floa
     return float(low[0] - room), float(high[0] + room), float(low[1] - room), float(high[1] + room)
 
 
-def _draw_floor(figure: Figure, ax: Axes, result: Localization, field: AnomalyMap | None) -> None:
+def _draw_floor(ax: Axes, result: Localization, field: AnomalyMap | None) -> None:
     t, pose = result.track.t, result.track.pose
     if field is not None:
-        known = mean_field_ut(field)
-        low, high = colour_limits(known)
-        colours = 0.45 * colormaps[COLOUR_MAP](np.linspace(0, 1, 64)) + 0.55  # lighter than the paths
-        pale = LinearSegmentedColormap.from_list("pale", np.minimum(colours, 1.0))
-        mesh = draw_cells(ax, field.x_m, field.y_m, known, pale, vmin=low, vmax=high)
-        colour_bar(figure, mesh, ax, "map, mean over headings [µT]")
+        draw_mean(ax, field)
     entries: list[Line2D | Patch] = []
 
-    def path(p: Array, name: str, ink: str, **look: object) -> None:
-        rows = evenly(len(p), 3000)
-        entries.extend(ax.plot(*p[rows, :2].T, color=ink, label=name, **look))  # type: ignore[arg-type]
+    def path(p: Array, name: str, **look: Any) -> None:
+        entries.extend(ax.plot(*p[evenly(len(p), 3000), :2].T, label=name, **look))
 
     if result.dead_reckoning is not None:
-        path(result.dead_reckoning.pose, _dead_name(result), DEAD_INK, lw=1.2, ls=(0, (4, 2)), zorder=3)
+        path(result.dead_reckoning.pose, _dead_name(result), zorder=3, **DEAD_LOOK)
     if result.truth is not None:
-        path(result.truth, _true_name(result), TRUTH_INK, lw=2.0, zorder=4)
+        path(result.truth, _true_name(result), color=INK, lw=2.0, zorder=4)
     trusted = np.where(result.track.lost[:, None], np.nan, pose)
-    path(trusted, "estimate", ESTIMATE_INK, lw=1.4, zorder=5)
+    path(trusted, "estimate", color=MODEL, lw=1.6, zorder=5)
     rows = _ellipse_rows(t, result.track.lost)
     rows = rows[np.isfinite(result.track.covariance[rows]).all(axis=(1, 2))]
     if len(rows):
         lines = [ellipse(pose[k, :2], result.track.covariance[k, :2, :2]) for k in rows]
-        ax.add_collection(LineCollection(lines, colors=ESTIMATE_INK, lw=1.0, zorder=6))
-        entries.append(Line2D([], [], color=ESTIMATE_INK, lw=1.0, marker="o", mfc="none", ms=9, ls=""))
+        ax.add_collection(LineCollection(lines, colors=MODEL, lw=1.0, zorder=6))
+        entries.append(Line2D([], [], color=MODEL, lw=1.0, marker="o", mfc="none", ms=9, ls=""))
         entries[-1].set_label("its 2-sigma ellipse")
     start = result.truth if result.truth is not None else pose
     entries.extend(
-        ax.plot(*start[0, :2], marker="s", ms=7, mfc="white", mec=INK, ls="", zorder=7, label="start")
+        ax.plot(*start[0, :2], marker="s", ms=7, mfc=PAPER, mec=INK, ls="", zorder=7, label="start")
     )
     ax.set_aspect("equal")
     label(ax, "x [m]", "y [m]")
-    _legend_above(ax, handles=entries)
+    legend_above(ax, 6, handles=entries)
 
 
 def ellipse(p_xy: Array, covariance: Array, sigmas: float = 2.0) -> Array:
@@ -174,14 +200,16 @@ def _draw_position(ax: Axes, result: Localization) -> None:
     log = most > WIDE * max(middle, 1e-6)
     floor = max(middle / 20, 1e-4) if log else 0.0
     if np.isfinite(sd).any():
-        ax.fill_between(t, floor, np.maximum(sd, floor), color=BAND_INK, lw=0, label="2 sigma")
+        ax.fill_between(t, floor, np.maximum(sd, floor), label="2 sigma", **BAND_LOOK)
     if dead is not None:
-        draw_line(ax, t, dead, color=DEAD_INK, ls=(0, (4, 2)), label=_dead_name(result))
+        draw_line(ax, t, dead, label=_dead_name(result), **DEAD_LOOK)
     if error is not None:
-        draw_line(ax, t, error, color=ESTIMATE_INK, lw=1.2, label="estimate")
+        draw_line(ax, t, error, color=MODEL, label="estimate")
     if result.bounds is not None:
-        draw_line(ax, t, result.bounds.correlated, color=BOUND_INK, lw=1.6, label="bound, 1 sigma")
-    _shade_lost(ax, result)
+        draw_line(
+            ax, t, result.bounds.correlated, color=BOUND, ls=(0, (1.5, 1.2)), lw=1.8, label="bound, 1 sigma"
+        )
+    shade(ax, t, track.lost, colour=LOST, name="flagged lost")
     most = max(most, float(np.nanmax(dead)) if dead is not None else 0.0)
     if log:
         ax.set_yscale("log")
@@ -190,9 +218,8 @@ def _draw_position(ax: Axes, result: Localization) -> None:
     else:
         ax.set_ylim(0, 1.08 * most)
     ax.set_xlim(t[0], t[-1])
-    open_frame(ax)
     label(ax, y="position\nerror [m]")
-    _legend_above(ax)
+    legend_above(ax, 6)
 
 
 def _draw_heading(ax: Axes, result: Localization) -> None:
@@ -200,30 +227,20 @@ def _draw_heading(ax: Axes, result: Localization) -> None:
     sd = np.degrees(2 * np.sqrt(track.covariance[:, 2, 2]))
     most = 1.0
     if np.isfinite(sd).any():
-        ax.fill_between(t, -sd, sd, color=BAND_INK, lw=0)
+        ax.fill_between(t, -sd, sd, **BAND_LOOK)
         most = float(np.nanquantile(sd, 0.9))
     if result.truth is not None:
         error = np.degrees(wrap_angle(track.pose[:, 2] - result.truth[:, 2]))
-        draw_line(ax, t, error, color=ESTIMATE_INK, lw=1.2)
+        draw_line(ax, t, error, color=MODEL)
         most = max(most, float(np.nanquantile(np.abs(error), 0.98)))
     if result.bounds is not None:
         for sign in (-1, 1):
-            draw_line(ax, t, sign * np.degrees(result.bounds.heading), color=BOUND_INK, lw=1.2)
-    _shade_lost(ax, result)
-    ax.set_ylim(-1.25 * most, 1.25 * most)
-    open_frame(ax)
+            draw_line(
+                ax, t, sign * np.degrees(result.bounds.heading), color=BOUND, ls=(0, (1.5, 1.2)), lw=1.6
+            )
+    shade(ax, t, track.lost, colour=LOST)
+    ax.set(xlim=(t[0], t[-1]), ylim=(-1.25 * most, 1.25 * most))
     label(ax, y="heading\nerror [°]")
-
-
-def _shade_lost(ax: Axes, result: Localization) -> None:
-    """Shade the times at which the method does not trust its pose."""
-    lost, t = result.track.lost, result.track.t
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]]).astype(int)))
-    name = "flagged lost"
-    for first, last in edges.reshape(-1, 2):
-        end = t[min(last, len(t) - 1)]
-        ax.axvspan(t[first], end, color=LOST_INK, lw=0, zorder=-1, label=name)
-        name = "_"
 
 
 def _true_name(result: Localization) -> str:
@@ -234,11 +251,6 @@ def _dead_name(result: Localization) -> str:
     """Name of dead reckoning, whose start the prior may not give."""
     known = all(map(math.isfinite, result.problem.prior.sd))
     return "dead reckoning" if known else "dead reckoning from the true start"
-
-
-def _legend_above(ax: Axes, **options: object) -> None:
-    place = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2, "columnspacing": 1.4}
-    ax.legend(ncols=6, fontsize=9, frameon=False, **place, **options)  # type: ignore[arg-type]
 
 
 def _title(result: Localization) -> str:
@@ -257,8 +269,8 @@ def save_localization(result: Localization, out: str | os.PathLike[str], *, forc
 
     Args:
         result: Result of `magtwin.tasks.localizing.localization`.
-        out: Folder to make, with run.parquet, localize.rrd, localize.png, estimate.tum and, if the true pose
-            is known, truth.tum.
+        out: Folder to make, with run.parquet, localize.rrd, .png and .html, estimate.tum and, if the true
+            pose is known, truth.tum.
         force: Whether to replace an existing folder.
 
     Raises:
@@ -278,6 +290,7 @@ def save_localization(result: Localization, out: str | os.PathLike[str], *, forc
             particles=result.track.particles,
         )
         save(draw_localization(result), folder / "localize.png")
+        (folder / "localize.html").write_text(to_html(page_of_localization(result)), encoding="utf-8")
         _save_tum(folder / "estimate.tum", result.track.t, result.track.pose)
         if result.truth is not None:
             known = np.isfinite(result.truth).all(axis=1)

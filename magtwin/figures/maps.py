@@ -1,7 +1,7 @@
-"""Maps: plots of an anomaly map, and of the difference between two surveys."""
+"""Maps: plots of anomaly maps, of the difference between two surveys, and of what stands on the floor."""
 
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,17 +9,33 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import BoundaryNorm, Colormap, ListedColormap
+from matplotlib.colors import BoundaryNorm, Colormap, LinearSegmentedColormap, ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, find
 from magtwin.field.maps.difference import LISTED, MapDifference
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
-from magtwin.figures.canvas import INK, Array, colour_bar, label, new_figure
+from magtwin.field.maps.statistics import colour_limits
+from magtwin.figures.canvas import Array, colour_bar, label, new_figure
+from magtwin.figures.style import (
+    BOUND,
+    FAINT,
+    FIELD_COLOURS,
+    INK,
+    MASKED,
+    PAPER,
+    SIGNED_COLOURS,
+    SLOPE_COLOURS,
+    SOFT,
+    SPREAD_COLOURS,
+    styled,
+)
+from magtwin.frames import rotate
+from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.scene import Scene
 
 MOST_NODES_A_SIDE = 600
 """Nodes drawn along a side of a map. A panel has no more pixels."""
@@ -30,92 +46,120 @@ MOST_PANELS = 8
 MOST_ASKED = 36
 """Most headings that can be asked for."""
 
-MOST_SHAPES = 10_000
-"""Cells above which an SVG holds them as a bitmap, as shapes would take megabytes."""
+MOST_MAPS = 4
+"""Most maps side by side."""
 
 BANDS = 20
 """Approximate number of colours of a map."""
 
-VALID, MASKED, MASKED_INK, HATCH = "#8fb8a8", "0.85", "0.65", "////"
+OVERVIEW = {
+    "mean": "mean over headings",
+    "heading effect": "heading effect: greatest less least",
+    "sd": "standard deviation, RMS over headings",
+    "gradient": "gradient of the mean along the floor",
+}
+"""What a map is drawn by, if nothing else is asked for."""
+
+HATCH = "////"
 
 
-def draw_map(field: AnomalyMap, *, what: str = "field", headings: Sequence[float] | None = None) -> Figure:
-    """Draw a map as filled contours, one panel per heading, all on one colour scale.
+@styled
+def draw_map(
+    field: AnomalyMap | Sequence[AnomalyMap],
+    *,
+    what: str = "overview",
+    headings: Sequence[float] | None = None,
+    plan: "FloorPlan | None" = None,
+) -> Figure:
+    """Draw a map as filled contours, or several maps side by side; each quantity has one colour scale.
 
-    The cells of masked nodes are hatched. The scale leaves out the outermost 0.5 % of the nodes at each end,
+    The cells of masked nodes are hatched. A scale leaves out the outermost 0.5 % of the nodes at each end,
     shown by the pointed ends of its bar; the scale of the field is that of the layer's coloured floor. A map
     with more than 600 nodes along a side is drawn at every second node, or third, and so on.
 
     Args:
-        field: The map.
-        what: "field"; "gradient", the slope of the magnitude along the floor by central differences;
+        field: The map, or up to `MOST_MAPS`; of several, each is drawn by its mean over headings.
+        what: "overview": the mean over headings, the difference that the heading makes, the standard
+            deviation and the gradient, as far as they are known. Or one quantity with a panel per heading:
+            "field"; "gradient", the slope of the magnitude along the floor by central differences;
             "variance", drawn as its root, the standard deviation; "mask", which nodes hold field; or
             "headings", each heading minus the mean over all of them.
         headings: Headings to show [rad], interpolated between layers. Default: the map's own, or about four
-            of more than eight.
+            of more than eight. Ignored by the overview.
+        plan: Walls, furniture and doors, drawn over each panel.
 
     Returns:
         A matplotlib figure.
 
     Raises:
-        InputError: There is no heading to show, or the map does not know the quantity.
+        InputError: There is no map or no heading to show, or the map does not know the quantity.
     """
-    quantity = find("quantity", what, QUANTITIES)
+    fields = [field] if isinstance(field, AnomalyMap) else list(field)
+    if not 1 <= len(fields) <= MOST_MAPS:
+        raise InputError(f"one to {MOST_MAPS} maps are drawn side by side, got {len(fields)}")
+    names = {"overview", *QUANTITIES} - {"mean", "heading effect", "sd"}
+    find("quantity", what, dict.fromkeys(sorted(names)))
     if headings is not None and len(headings) == 0:
         raise InputError("headings must name one heading at least, got none")
     if headings is not None and len(headings) > MOST_ASKED:
         raise InputError(f"headings to show are {MOST_ASKED} at most, a panel each, got {len(headings)}")
-    if what != "mask" and not field.valid.any():
-        raise InputError(f"map {field.name!r} has no valid node to draw")
-    layers = quantity.layers(field)
-    if headings is None:
-        every = -(-len(layers) // 4) if len(layers) > MOST_PANELS else 1
-        shown, layers = field.headings_rad[::every], layers[::every]
+    for one in fields:
+        if what != "mask" and not one.valid.any():
+            raise InputError(f"map {one.name!r} has no valid node to draw")
+    if what == "overview":
+        every = [_overview(name, one) for name in OVERVIEW for one in fields]
+        panels = [panel for panel in every if panel is not None]
     else:
-        shown = np.asarray(headings, float)
-        layers = _between_headings(field, layers, shown)
-    if what != "mask" and not np.isfinite(layers).any():
-        raise InputError(f"map {field.name!r} has no node whose {what} is known")
-    unknown = np.isnan(layers).sum(axis=(1, 2))
-    every = -(-max(layers.shape[1:]) // MOST_NODES_A_SIDE)
-    j, i = (np.unique(np.append(np.arange(0, n, every), n - 1)) for n in layers.shape[1:])
-    x, y, layers = field.x_m[i], field.y_m[j], layers[:, j][:, :, i]
-    figure, axes = _panels(field.extent, len(shown))
-    legend = []
-    if what == "mask":
-        for ax, layer in zip(axes, layers, strict=False):
-            draw_cells(ax, x, y, layer, ListedColormap([VALID]))
-        legend.append(Patch(label="holds field", facecolor=VALID))
-    else:
-        scale = _Scale.of(layers, quantity)
-        drawn = [scale.draw(ax, x, y, layer) for ax, layer in zip(axes, layers, strict=False)]
-        ticks = scale.levels[:: max(1, len(scale.levels) // 10)]
-        colour_bar(figure, drawn[0], axes.tolist(), quantity.label, ticks=ticks)
-    for ax, heading, count in zip(axes, shown, unknown, strict=False):
-        masked = f", {count} masked" if what == "mask" else ""
-        ax.set_title(f"heading {np.degrees(heading):.4g}°{masked}", fontsize=10)
-    if np.isnan(layers).any():
-        legend.append(_hatched(quantity.unknown))
-    _legend(figure, legend)
-    figure.suptitle(_summary(field, 112 if len(shown) > 1 else 52), fontsize=11)
+        panels = [
+            panel for one in fields for panel in _by_heading(what, one, headings, several=len(fields) > 1)
+        ]
+    columns = len(fields) if len(fields) > 1 and what == "overview" else min(len(panels), 2)
+    figure, axes = _panels(fields[0].extent, len(panels), columns)
+    legend = {}
+    for name in dict.fromkeys(panel.quantity for panel in panels):
+        quantity, mine = QUANTITIES[name], [k for k, panel in enumerate(panels) if panel.quantity == name]
+        scale = None if name == "mask" else _Scale.of([panels[k].layer for k in mine], quantity)
+        for k in mine:
+            panel, ax = panels[k], axes[k]
+            x, y, layer = _thinned(panel)
+            if scale is None:
+                draw_cells(ax, x, y, layer, ListedColormap([FAINT]))
+                legend["holds field"] = Patch(facecolor=FAINT)
+            else:
+                drawn = scale.draw(ax, x, y, layer)
+            ax.set_title(panel.title)
+            if plan is not None:
+                plan.draw(ax)
+            if np.isnan(layer).any():
+                legend[quantity.unknown] = _hatched()
+        if scale is not None:
+            ticks = scale.levels[:: max(1, len(scale.levels) // 8)]
+            colour_bar(figure, drawn, [axes[k] for k in mine], quantity.label, ticks=ticks)
+    if plan is not None:
+        legend |= plan.keys()
+    if legend:
+        figure.legend(legend.values(), legend.keys(), loc="outside lower right", ncols=3)
+    if len(fields) == 1:
+        figure.suptitle(_summary(fields[0], 100 if len(panels) > 1 else 46), x=0.01, ha="left")
     return figure
 
 
+@styled
 def draw_difference(difference: MapDifference) -> Figure:
     """Draw what changed between two surveys and how certain it is; regions have the numbers of the report."""
     grid, count = difference.grid, np.isfinite(difference.z).sum(axis=0)
     local = np.where(count, np.nansum(difference.local_nt, axis=0) / np.maximum(count, 1), np.nan)
     most = np.nanargmax(np.where(np.isfinite(difference.z), np.abs(difference.z), -1.0), axis=0)
     z = np.take_along_axis(difference.z, most[None], axis=0)[0]
-    figure, axes = _panels(grid.extent, 2)
+    figure, axes = _panels(grid.extent, 2, 2)
     several = ", mean over headings" if len(difference.z) > 1 else ""
     for ax, layer, title in (
         (axes[0], local, f"local change{several} [nT]"),
         (axes[1], z, "z, of the heading where it is greatest" if several else "z"),
     ):
         reach = max(map(abs, colour_limits(layer, 0))) or 1.0  # all values: the peaks matter here
-        cells = draw_cells(ax, grid.x_m, grid.y_m, layer, "RdBu_r", vmin=-reach, vmax=reach)
-        colour_bar(figure, cells, ax, title)
+        cells = draw_cells(ax, grid.x_m, grid.y_m, layer, SIGNED_COLOURS, vmin=-reach, vmax=reach)
+        colour_bar(figure, cells, ax, title, below=True)
         _draw_regions(ax, difference)
     names = [" ".join(t for t in pair if t) for pair in zip(difference.names, difference.days, strict=True)]
     changed, regions = int(difference.changed.any(axis=0).sum()), len(difference.regions)
@@ -126,10 +170,12 @@ def draw_difference(difference: MapDifference) -> Figure:
     ]
     if not difference.from_variance:
         words.append("no variance is known: z by the robust spread")
-    lines = [f"{names[0]} to {names[1]}", *textwrap.wrap(", ".join(words), 112)]
-    figure.suptitle("\n".join(lines), fontsize=11)
-    legend = [Patch(label="changed region", facecolor="none", edgecolor=INK)] if regions else []
-    _legend(figure, legend + ([] if count.all() else [_hatched("not known to both surveys")]))
+    lines = [f"{names[0]} to {names[1]}", *textwrap.wrap(", ".join(words), 100)]
+    figure.suptitle("\n".join(lines))
+    legend = {"changed region": Patch(facecolor="none", edgecolor=INK)} if regions else {}
+    legend |= {} if count.all() else {"not known to both surveys": _hatched()}
+    if legend:
+        figure.legend(legend.values(), legend.keys(), loc="outside lower right", ncols=2)
     return figure
 
 
@@ -146,30 +192,98 @@ def draw_cells(
         colours: The colour scale, or its name.
         look: Further options of `pcolormesh`, such as `vmin` and `vmax`.
     """
-    ax.set_facecolor(MASKED)
-    ax.patch.set(hatch=HATCH, edgecolor=MASKED_INK)
+    if np.isnan(layer).any():
+        ax.set_facecolor(MASKED)
+        ax.patch.set(hatch=HATCH, edgecolor=FAINT)
     ax.set_aspect("equal")
-    ax.tick_params(labelsize=8)
-    look = {"rasterized": layer.size > MOST_SHAPES, **look}
+    look = {"rasterized": True, **look}
     return ax.pcolormesh(x_m, y_m, np.ma.masked_invalid(layer), shading="nearest", cmap=colours, **look)
 
 
-def mean_field_ut(field: AnomalyMap) -> Array:
-    """Mean of a map over its headings [µT], nan where a heading is masked, shape (Y, X)."""
-    return np.where(field.valid.all(axis=0), field.values_nt.mean(axis=0), np.nan) / 1000
+def mean_field_nt(field: AnomalyMap) -> Array:
+    """Mean of a map over its headings [nT], nan where a heading is masked, shape (Y, X)."""
+    return np.where(field.valid.all(axis=0), field.values_nt.mean(axis=0), np.nan)
 
 
-def _hatched(name: str) -> Patch:
-    return Patch(label=name, facecolor=MASKED, hatch=HATCH, edgecolor=MASKED_INK)
+def draw_mean(ax: Axes, field: AnomalyMap, *, quiet: bool = True) -> tuple[float, float]:
+    """Draw a map's mean over headings with its bar, paler if `quiet`; returns the ends of the scale [nT]."""
+    known = mean_field_nt(field)
+    low, high = colour_limits(known)
+    colours = colormaps[FIELD_COLOURS]
+    if quiet:
+        pale = 0.5 * colours(np.linspace(0, 1, 64)) + 0.5
+        colours = LinearSegmentedColormap.from_list("pale", np.minimum(pale, 1.0))
+    mesh = draw_cells(ax, field.x_m, field.y_m, known, colours, vmin=low, vmax=high)
+    colour_bar(ax.figure, mesh, ax, "map, mean over headings [nT]", below=True)
+    return low, high
 
 
-def _panels(extent: tuple[float, float, float, float], count: int) -> tuple[Figure, NDArray[Any]]:
-    """A figure with `count` panels of one floor, two per row, and its axes."""
-    columns = min(count, 2)
+@dataclass(frozen=True)
+class FloorPlan:
+    """What stands on a floor, seen from above: outlines in world [m], each of shape (K, 2)."""
+
+    solids: tuple[Array, ...]
+    """What a robot runs into, walls among it."""
+
+    pieces: tuple[Array, ...] = ()
+    """Furniture, as wide as it is anywhere."""
+
+    doors: tuple[Array, ...] = ()
+
+    @classmethod
+    def of(cls, scene: Scene, obstacles: Obstacles) -> "FloorPlan":
+        """The plan of a scene."""
+        found: dict[bool, list[Array]] = {False: [], True: []}
+        for piece in scene.furniture:
+            corners = [
+                rotate(piece.q_world_xyzw, np.array(part.p) + np.array(part.size_m) * _ENDS / 2)[:, :2]
+                for part in piece.parts
+            ]
+            hull = Obstacles((piece.name,), (np.vstack(corners) + piece.p_world[:2],))
+            found[piece.kind.startswith("door")].append(hull.outlines[0])
+        return cls(obstacles.outlines, tuple(found[False]), tuple(found[True]))
+
+    def draw(self, ax: Axes) -> None:
+        """Draw the outlines, and widen the view to hold them."""
+        for outlines, look in (
+            (self.pieces, {"fc": FAINT, "ec": SOFT, "alpha": 0.45, "lw": 0.8}),
+            (self.solids, {"fc": SOFT, "ec": SOFT, "lw": 0.6}),
+            (self.doors, {"fc": "none", "ec": BOUND, "lw": 1.6}),
+        ):
+            for outline in outlines:
+                ax.add_patch(Polygon(outline, **{"zorder": 2.5, **look}))
+        every = [*self.solids, *self.pieces, *self.doors]
+        if every:
+            (x0, y0), (x1, y1) = np.vstack(every).min(axis=0), np.vstack(every).max(axis=0)
+            left, right, low, high = (*ax.get_xlim(), *ax.get_ylim())
+            ax.set(
+                xlim=(min(left, x0 - 0.1), max(right, x1 + 0.1)),
+                ylim=(min(low, y0 - 0.1), max(high, y1 + 0.1)),
+            )
+
+    def keys(self) -> dict[str, Patch]:
+        """Entries of a legend."""
+        looks = {"solid near the floor": {"fc": SOFT}, "furniture": {"fc": FAINT, "ec": SOFT, "alpha": 0.45}}
+        looks |= {"door": {"fc": "none", "ec": BOUND}}
+        shown = zip(looks.items(), (self.solids, self.pieces, self.doors), strict=True)
+        return {name: Patch(**look) for (name, look), outlines in shown if outlines}
+
+
+_ENDS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+
+
+def _hatched() -> Patch:
+    return Patch(facecolor=MASKED, hatch=HATCH, edgecolor=FAINT)
+
+
+def _panels(
+    extent: tuple[float, float, float, float], count: int, columns: int
+) -> tuple[Figure, NDArray[Any]]:
+    """A figure with `count` panels of one floor, and its axes."""
     rows = -(-count // columns)
     x0, x1, y0, y1 = extent
     tall = float(np.clip((y1 - y0) / (x1 - x0), 0.3, 2))
-    figure = new_figure(4.9 * columns + 1.3, (4.4 * tall + 0.55) * rows + 1.3)
+    figure = new_figure(5.4 * columns + 0.6, (4.4 * tall + 0.7) * rows + 1.2)
     figure.set_layout_engine("constrained", h_pad=0.08)  # keeps titles off the panels above
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
     for k, ax in enumerate(axes[:count]):
@@ -182,13 +296,13 @@ def _panels(extent: tuple[float, float, float, float], count: int) -> tuple[Figu
     return figure, axes
 
 
-def _legend(figure: Figure, handles: list[Patch]) -> None:
-    if handles:
-        figure.legend(handles=handles, loc="outside lower right", fontsize=9, frameon=False, ncols=2)
+def _known_nt(field: AnomalyMap) -> Array:
+    return np.where(field.valid, field.values_nt, np.nan)
 
 
-def _field_ut(field: AnomalyMap) -> Array:
-    return np.where(field.valid, field.values_nt, np.nan) / 1000
+def _slope(values: Array, field: AnomalyMap) -> Array:
+    """Size of the gradient along the floor [nT/m], of the last two axes."""
+    return np.hypot(*np.gradient(values, *field.cell_m[::-1], axis=(-2, -1)))
 
 
 def _sd_nt(field: AnomalyMap) -> Array:
@@ -214,7 +328,7 @@ class _Quantity:
     label: str
     """Its name and unit."""
 
-    colours: str = COLOUR_MAP
+    colours: str = FIELD_COLOURS
     """Name of its colour scale."""
 
     about_zero: bool = False
@@ -224,25 +338,85 @@ class _Quantity:
     """Meaning of hatched nodes."""
 
 
-QUANTITIES = {
-    "field": _Quantity(_field_ut, "total field [µT]"),
+QUANTITIES: Mapping[str, _Quantity] = {
+    "field": _Quantity(_known_nt, "total field [nT]"),
     "gradient": _Quantity(
-        lambda field: np.hypot(*np.gradient(_field_ut(field), *field.cell_m[::-1], axis=(1, 2))),
-        "gradient along the floor [µT/m]",
-        "magma",
+        lambda field: _slope(_known_nt(field), field),
+        "gradient [nT/m]",
+        SLOPE_COLOURS,
         unknown="masked, or beside a masked node",
     ),
-    "variance": _Quantity(_sd_nt, "standard deviation [nT]", "cividis"),
+    "variance": _Quantity(_sd_nt, "standard deviation [nT]", SPREAD_COLOURS),
     "mask": _Quantity(lambda field: np.where(field.valid, 1.0, np.nan), "holds field"),
     "headings": _Quantity(
         _heading_difference_nt,
         "difference from the mean over headings [nT]",
-        "RdBu_r",
+        SIGNED_COLOURS,
         about_zero=True,
         unknown="masked in some heading",
     ),
+    "mean": _Quantity(lambda field: mean_field_nt(field)[None], "[nT]"),
+    "heading effect": _Quantity(
+        lambda field: np.ptp(_heading_difference_nt(field), axis=0)[None],
+        "[nT]",
+        "plasma",
+        unknown="masked in some heading",
+    ),
+    "sd": _Quantity(
+        lambda field: np.sqrt(np.mean(_sd_nt(field) ** 2, axis=0))[None],
+        "[nT]",
+        SPREAD_COLOURS,
+    ),
 }
 """Quantities of a map that can be drawn, by name."""
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """One layer of a map, to be drawn by the scale of its quantity."""
+
+    title: str
+    quantity: str
+    field: AnomalyMap
+    layer: Array
+
+
+def _overview(name: str, field: AnomalyMap) -> _Panel | None:
+    """A quantity of the overview; None if the map does not know it."""
+    if (name == "heading effect" and len(field.headings_rad) < 2) or (
+        name == "sd" and field.variance_nt2 is None
+    ):
+        return None
+    layer = _slope(mean_field_nt(field), field) if name == "gradient" else QUANTITIES[name].layers(field)[0]
+    return _Panel(OVERVIEW[name], name, field, layer) if np.isfinite(layer).any() else None
+
+
+def _by_heading(
+    what: str, field: AnomalyMap, headings: Sequence[float] | None, *, several: bool
+) -> list[_Panel]:
+    """A quantity of a map, one panel per heading."""
+    layers = QUANTITIES[what].layers(field)
+    if headings is None:
+        every = -(-len(layers) // 4) if len(layers) > MOST_PANELS else 1
+        shown, layers = field.headings_rad[::every], layers[::every]
+    else:
+        shown = np.asarray(headings, float)
+        layers = _between_headings(field, layers, shown)
+    if what != "mask" and not np.isfinite(layers).any():
+        raise InputError(f"map {field.name!r} has no node whose {what} is known")
+    panels = []
+    for heading, layer in zip(shown, layers, strict=True):
+        masked = f", {np.isnan(layer).sum()} masked" if what == "mask" else ""
+        title = f"{field.name}, " * several + f"heading {np.degrees(heading):.4g}°{masked}"
+        panels.append(_Panel(title, what, field, layer))
+    return panels
+
+
+def _thinned(panel: _Panel) -> tuple[Array, Array, Array]:
+    """Nodes along x and y [m], and values, of as many nodes as can be told apart."""
+    every = -(-max(panel.layer.shape) // MOST_NODES_A_SIDE)
+    j, i = (np.unique(np.append(np.arange(0, n, every), n - 1)) for n in panel.layer.shape)
+    return panel.field.x_m[i], panel.field.y_m[j], panel.layer[j][:, i]
 
 
 @dataclass(frozen=True)
@@ -256,15 +430,15 @@ class _Scale:
     """Ends of the colour bar that are pointed, as values lie beyond them."""
 
     @classmethod
-    def of(cls, layers: Array, quantity: _Quantity) -> "_Scale":
+    def of(cls, layers: Sequence[Array], quantity: _Quantity) -> "_Scale":
         """Bands over the known values of all panels."""
-        low, high = colour_limits(layers)
+        known = np.concatenate([layer[np.isfinite(layer)] for layer in layers])
+        low, high = colour_limits(known)
         if quantity.about_zero:
             low, high = -max(-low, high), max(-low, high)
         if not high - low > 1e-6 * abs(high):  # one value everywhere
             low, high = (low - 0.1 * abs(low), high + 0.1 * abs(high)) if high else (-1.0, 1.0)
         levels = np.asarray(MaxNLocator(BANDS, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))
-        known = layers[np.isfinite(layers)]
         beyond = (bool((known < levels[0]).any()), bool((known > levels[-1]).any()))
         extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
         return cls(levels, (low, high), colormaps[quantity.colours], extend)
@@ -276,9 +450,10 @@ class _Scale:
         bands = self.colours(np.clip((middle - low) / (high - low), 0, 1))
         colours = ListedColormap(bands).with_extremes(under=bands[0], over=bands[-1])
         norm = BoundaryNorm(self.levels, len(bands))
-        draw_cells(ax, x, y, layer, colours, norm=norm, zorder=0.5, rasterized=True)
+        draw_cells(ax, x, y, layer, colours, norm=norm, zorder=0.5)
         look: dict[str, Any] = {"cmap": colours, "norm": norm, "extend": self.extend, "zorder": 0.6}
         drawn = ax.contourf(x, y, np.ma.masked_invalid(layer), self.levels, **look)
+        drawn.set_rasterized(True)
         ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
         return drawn
 
@@ -309,9 +484,7 @@ def _draw_regions(ax: Axes, difference: MapDifference) -> None:
             xytext=(2, -2),
             textcoords="offset points",
             va="top",
-            fontsize=8,
-            color=INK,
-            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
+            bbox={"boxstyle": "round,pad=0.15", "fc": PAPER, "ec": "none", "alpha": 0.8},
         )
 
 
@@ -319,9 +492,9 @@ def _summary(field: AnomalyMap, width: int) -> str:
     """The map's name, and its figures in lines of at most `width` characters."""
     figures = {f.name: f for f in field.report().figures}
     mean = figures["mean"]
-    words = [f"mean {float(mean.value) / 1000:.2f} µT", f"sd {(mean.spread or 0) / 1000:.2f} µT"]
+    words = [f"mean {float(mean.value):,.0f} nT", f"sd {mean.spread or 0:,.0f} nT"]
     if "median gradient" in figures:
-        words.append(f"median gradient {float(figures['median gradient'].value):.1f} µT/m")
+        words.append(f"median gradient {1000 * float(figures['median gradient'].value):,.0f} nT/m")
     if "heading amplitude" in figures:
         words.append(f"heading amplitude {float(figures['heading amplitude'].value):.0f} nT")
     if field.height_m is not None:

@@ -11,6 +11,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from magtwin.errors import InputError
 from magtwin.figures.canvas import Picture
 from magtwin.figures.player import Player
+from magtwin.figures.style import CSS, inline_svg
 from magtwin.files.outputs import output
 from magtwin.report.summary import printable, printable_lines
 from magtwin.version import __version__
@@ -54,7 +56,10 @@ class Table:
     rows: tuple[tuple[Any, ...], ...]
     note: str = ""
     exact: bool = False
-    """Whether numbers are shown as they are: a seed of 1234 not as "1,234"."""
+    """Whether numbers are shown as they are: a seed of 1234 not as "1,234". Such a table is folded."""
+
+    folded: bool = False
+    """Whether only its title is shown until it is opened."""
 
     def columns(self) -> Iterator[tuple[str, bool]]:
         """Head of each column, and whether the column is aligned as numbers."""
@@ -97,6 +102,12 @@ class Page:
 
     player: Player | None = None
     """What plays the run in its lab, above the sections; only HTML has it."""
+
+    verdict: str = ""
+    """What the page says, in one or a few lines; shown first."""
+
+    figures: Sequence[tuple[str, str]] = ()
+    """What is in it in about five figures, each with its name."""
 
 
 def write_page(page: Page, path: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -143,12 +154,17 @@ def write_pages(page: Page, folder: str | os.PathLike[str], name: str, *, force:
 def to_html(page: Page) -> str:
     """A page as one HTML file."""
     links = [f"#run-{k}" for k in range(len(page.sections))]
-    return _TEMPLATES.get_template("page.html").render(page=page, links=links, version=__version__)
+    return _TEMPLATES.get_template("page.html").render(page=page, links=links, css=CSS, version=__version__)
 
 
 def to_json(page: Page) -> str:
     """The data of a page as JSON; numbers that are not finite become null."""
-    return json.dumps(_finite({"magtwin": __version__, "title": page.title, **page.data}), indent=2) + "\n"
+    head = {
+        "magtwin": __version__,
+        "title": page.title,
+        **({"verdict": page.verdict} if page.verdict else {}),
+    }
+    return json.dumps(_finite({**head, **page.data}), indent=2) + "\n"
 
 
 WRITERS: Mapping[str, Callable[[Page], str]] = {".html": to_html, ".json": to_json}
@@ -185,6 +201,18 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def _drawn(picture: Picture, prefix: str) -> str:
+    """A picture as HTML: an SVG as a part of the page, whose colours follow it; a PNG as an image."""
+    alt = escape(printable(picture.alt))
+    if picture.kind == "svg":
+        return inline_svg(picture.data, prefix).replace("<svg", f'<svg role="img" aria-label="{alt}"', 1)
+    return f'<img alt="{alt}" src="data:image/{picture.kind};base64,{_base64(picture.data)}">'
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")
+
+
 def _shown(value: Any) -> Any:
     """A value for a page; a text without control characters. Jinja escapes it for HTML."""
     return printable_lines(value) if type(value) is str else value
@@ -198,4 +226,4 @@ _TEMPLATES = Environment(
     undefined=StrictUndefined,
     finalize=_shown,
 )
-_TEMPLATES.filters |= {"text": text_of, "base64": lambda data: base64.b64encode(data).decode("ascii")}
+_TEMPLATES.filters |= {"text": text_of, "base64": _base64, "drawn": _drawn}

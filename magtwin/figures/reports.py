@@ -1,6 +1,7 @@
 """Reports: one run or several as a page; two runs compared; and one path driven twice."""
 
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,23 +14,20 @@ from numpy.typing import ArrayLike
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.figures.canvas import (
-    INK,
-    MAP_INK,
-    OTHER_INK,
     POINTS,
-    WIDTH_IN,
-    Picture,
+    Chart,
     draw_line,
     evenly,
     label,
     legend_above,
     new_figure,
-    picture,
     short_pair,
 )
 from magtwin.figures.page import Page, Section, Table
 from magtwin.figures.player import Player, player_of
 from magtwin.figures.runs import field_name, path_picture, position_name
+from magtwin.figures.style import DATA, MODEL, styled
+from magtwin.report.report import Report
 from magtwin.run.compare import ERRORS, Agreement, Comparison, Traversals, errors_of, terms_of
 from magtwin.run.figures import prediction_nt
 from magtwin.run.run import COLUMNS, Metadata, Run
@@ -123,13 +121,12 @@ def _sentence(run: Run) -> str:
 
 def _section(named: NamedRun, pictures: bool) -> Section:
     run = named.run
-    rows: tuple[tuple[Any, ...], ...] = tuple(
-        (f.name, f.value, "" if f.spread is None else f.spread, f.unit, f.note) for f in run.report().figures
-    )
-    tables = [Table("Figures", ("quantity", "value", "standard deviation", "unit", "note"), rows)]
+    tables = [figures_table(run.report())]
     errors = errors_of(run)
     if errors:
-        rows = tuple((name, ERRORS[name][2], *_measures(row), row.count) for name, row in errors.items())
+        rows: tuple[tuple[Any, ...], ...] = tuple(
+            (name, ERRORS[name][2], *_measures(row), row.count) for name, row in errors.items()
+        )
         terms = (f"{name} = {' - '.join(terms_of(run, name))}" for name in errors)
         note = f"Each error is the difference of columns: {'; '.join(terms)}"
         coverage = _coverage(run)
@@ -143,11 +140,39 @@ def _section(named: NamedRun, pictures: bool) -> Section:
     )
     head = ("flag", "meaning", "readings", "times [s]")
     tables.append(Table("Events", head, events, "" if events else "None."))
-    rows = tuple(run.metadata.items())
-    tables.append(Table("Provenance", ("metadata", ""), rows, "" if rows else "No metadata.", exact=True))
+    tables.append(provenance_table(run.metadata))
     drawn = path_picture(run, named.field, named.planned) if pictures else None
     lead = f"{named.name}: {_sentence(run)} {named.note}".strip()
     return Section(_title(named), lead, () if drawn is None else (drawn,), tuple(tables))
+
+
+def page_of_report(
+    report: Report, title: str, lead: str = "", charts: Sequence[Chart] = (), tables: Sequence[Table] = ()
+) -> Page:
+    """A report as a page: its verdict, first figures, charts, and tables, its source folded."""
+    shown = [
+        (f.name, f"{f.value:,.5g} {f.unit}".strip())
+        for f in report.figures
+        if isinstance(f.value, float | int)
+    ]
+    tables = (*tables, figures_table(report), provenance_table(report.metadata))
+    section = Section(title, "", tuple(chart.picture() for chart in charts), tables)
+    data = json.loads(report.to_json())
+    return Page(title, lead, (section,), verdict=report.verdict, figures=shown[:5], data=data)
+
+
+def figures_table(report: Report) -> Table:
+    """The figures of a report."""
+    rows = tuple(
+        (f.name, f.value, "" if f.spread is None else f.spread, f.unit, f.note) for f in report.figures
+    )
+    return Table("Figures", ("quantity", "value", "standard deviation", "unit", "note"), rows)
+
+
+def provenance_table(metadata: Mapping[str, Any], title: str = "Provenance") -> Table:
+    """Where something comes from."""
+    rows = tuple(metadata.items())
+    return Table(title, ("metadata", ""), rows, "" if rows else "No metadata.", exact=True)
 
 
 def _player(named: NamedRun) -> Player:
@@ -218,16 +243,40 @@ def _correlation(agreement: Agreement) -> str:
     return "" if agreement.correlation is None else f"{agreement.correlation:.4f}"
 
 
+@styled
 def draw_comparison(a: NamedRun, b: NamedRun, comparison: Comparison) -> Figure:
     """Draw two runs by their own clocks, and aligned, as `magtwin.run.compare.compare` compared them."""
-    panels = _panels(a, b, comparison)
-    heights = [height for _, height, _ in panels]
-    figure = new_figure(9.0, 2.3 * sum(heights))
-    axes = figure.subplots(len(panels), 1, squeeze=False, height_ratios=heights)[:, 0]
-    for ax, (title, _, draw) in zip(axes, panels, strict=True):
-        draw(ax)
-        ax.set_title(title, fontsize=10, loc="right")
+    charts = _charts(a, b, comparison)
+    heights = [chart.height_in for chart in charts]
+    figure = new_figure(9.0, 0.95 * sum(heights))
+    axes = figure.subplots(len(charts), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for ax, chart in zip(axes, charts, strict=True):
+        chart.draw(ax)
+        ax.set_title(chart.title, loc="right")
     return figure
+
+
+def page_of_comparison(a: NamedRun, b: NamedRun, comparison: Comparison) -> Page:
+    """Two runs compared, as `magtwin.run.compare.compare` did: how far they are apart, and where."""
+    rows = comparison.agreements()
+    field = next((row for row in rows if row.unit == "nT"), None)
+    apart = [row for row in rows if row.unit == "m"]
+    words = [f"{field.name} by {field.rms:,.1f} nT (RMS)"] if field else []
+    words += [f"{row.name} by {row.rms:.3g} m (RMS)" for row in apart]
+    moved = f"moved by {comparison.shift:+.3f} {comparison.unit}"
+    how = "clocks as recorded" if comparison.align == "none" else moved
+    figures = [("readings compared", f"{len(comparison.at):,}"), ("alignment", how)]
+    figures += [(f"{row.name}, RMS", f"{row.rms:,.4g} {row.unit}") for row in rows[:3]]
+    pictures = tuple(chart.picture() for chart in _charts(a, b, comparison))
+    head = ("quantity", "unit", *MEASURES, "correlation", "readings")
+    cells = tuple((row.name, row.unit, *_measures(row), _correlation(row), row.count) for row in rows)
+    tables = [Table("Differences", head, cells, f"{b.name} minus {a.name}.")]
+    tables += [provenance_table(one.run.metadata, f"Provenance of {one.name}") for one in (a, b)]
+    verdict = f"{b.name} differs from {a.name}: {', '.join(words) or 'nothing can be compared'}, {how}."
+    section = Section("Differences", "", pictures, tuple(tables))
+    return Page(
+        "Two runs compared", "", (section,), verdict=verdict, figures=figures, data=comparison.summary()
+    )
 
 
 def section_of_traversals(both: Traversals, names: tuple[str, str]) -> Section:
@@ -237,80 +286,72 @@ def section_of_traversals(both: Traversals, names: tuple[str, str]) -> Section:
         both: Result of `magtwin.run.compare.traversals`.
         names: Names of the two runs.
     """
-    runs = [f"{name}: {_driven(run.metadata)}" for name, run in zip(names, (both.a, both.b), strict=True)]
-    rows = tuple(
-        (text, row.name, row.unit, *_measures(row), _correlation(row))
-        for key, text in ALIGNED.items()
-        for row in getattr(both, key).agreements()
-    )
-    head = ("aligned", "quantity", "unit", "mean", "RMS", "MAE", "maximum", "correlation")
+    a, b = (NamedRun(name, run) for name, run in zip(names, (both.a, both.b), strict=True))
+    rows, pictures = [], []
+    for key, text in ALIGNED.items():
+        comparison: Comparison = getattr(both, key)
+        wanted = ("aligned", "distance") if key == "recorded" else ("aligned",)
+        for chart in _charts(a, b, comparison):
+            if chart.file in wanted:
+                title, file = f"Figure 8: {text}: {chart.title}", f"figure_8_{key}_{chart.file}"
+                pictures.append(replace(chart, title=title, file=file).picture())
+        rows += [
+            (text, row.name, row.unit, *_measures(row), _correlation(row)) for row in comparison.agreements()
+        ]
+    head = ("aligned", "quantity", "unit", *MEASURES, "correlation")
     note = f"{names[1]} minus {names[0]}. Along-track: ahead of the first run; cross-track: to its left."
-    title = "One path, driven twice"
-    drawing = _traversals_picture(both, names)
-    pictures = () if drawing is None else (drawing,)
-    return Section(title, "; ".join(runs) + ".", pictures, (Table(title, head, rows, note),))
+    title, runs = "One path, driven twice", [f"{one.name}: {_driven(one.run.metadata)}" for one in (a, b)]
+    return Section(title, "; ".join(runs) + ".", tuple(pictures), (Table(title, head, tuple(rows), note),))
 
 
-def _panels(
-    a: NamedRun, b: NamedRun, comparison: Comparison
-) -> list[tuple[str, float, Callable[[Axes], None]]]:
-    """Title, height and drawing of the field as recorded and aligned, the distance, and both paths."""
+def _charts(a: NamedRun, b: NamedRun, comparison: Comparison) -> list[Chart]:
+    """The field as recorded and aligned, the distance, and both paths, as far as they are known."""
     column, position = field_name(a.run, b.run), position_name(a.run, b.run)
     names = short_pair((a.name, b.name))
     along = "distance driven [m]" if comparison.align == "path" else "time [s]"
-    lines = tuple(zip((a.run, b.run), names, (INK, OTHER_INK), strict=True))
+    looks: tuple[dict[str, Any], ...] = (
+        {"color": DATA, "lw": 2.2, "alpha": 0.6},
+        {"color": MODEL, "lw": 1.1},
+    )
 
-    def recorded(ax: Axes) -> None:
-        for run, name, ink in lines:
-            draw_line(ax, run["t"] - run["t"][0], run[str(column)] / 1000, color=ink, label=name)
-        _finish(ax, "time from the start of each run [s]", "field [µT]")
+    def lines(
+        x: str, y: str, *curves: tuple[Any, Any], names: Sequence[str] = names
+    ) -> Callable[[Axes], None]:
+        def draw(ax: Axes) -> None:
+            for (at, values), name, look in zip(curves, names, looks, strict=True):
+                draw_line(ax, at, values, label=name, **look)
+            ax.margins(x=0)
+            label(ax, x, y)
+            legend_above(ax, 2)
 
-    def aligned(ax: Axes) -> None:
-        for values, (_, name, ink) in zip(comparison.fields[str(column)], lines, strict=True):
-            draw_line(ax, comparison.at, values / 1000, color=ink, label=name)
-        _finish(ax, along, "field [µT]")
+        return draw
 
     def paths(ax: Axes) -> None:
-        looks: tuple[dict[str, Any], ...] = ({"lw": 2.6, "alpha": 0.45}, {"lw": 1.0})
-        for (run, name, ink), look in zip(lines, looks, strict=True):
-            rows = evenly(run.rows, POINTS)
-            ax.plot(*run[str(position)][rows, :2].T, label=name, color=ink, **look)
+        for run, name, look in zip((a.run, b.run), names, looks, strict=True):
+            ax.plot(*run[str(position)][evenly(run.rows, POINTS), :2].T, label=name, **look)
         ax.set_aspect("equal")
         ax.margins(0.05)
         label(ax, "x [m]", "y [m]")
-        legend_above(ax)
+        legend_above(ax, 2)
 
-    panels: list[tuple[str, float, Callable[[Axes], None]]] = []
+    charts = []
     if column is not None:
         match = next((row for row in comparison.agreements() if row.name == column), None)
-        title = f"{names[1]} moved by {comparison.shift:+.3f} {comparison.unit}"
-        if comparison.align == "none":
-            title = "clocks unchanged"
+        title = "aligned" if comparison.align != "none" else "clocks unchanged"
         if match is not None:
             title += f": RMS {match.rms:,.0f} nT"
             title += "" if match.correlation is None else f", correlation {match.correlation:.3f}"
-        panels += [(f"{column} as recorded", 1.0, recorded), (title, 1.0, aligned)]
+        clocks = [(run["t"] - run["t"][0], run[column]) for run in (a.run, b.run)]
+        x, y = "time from the start of each run [s]", f"{column.removesuffix('_nt')} [nT]"
+        charts.append(Chart("as recorded", lines(x, y, *clocks), file="recorded"))
+        values = [(comparison.at, part) for part in comparison.fields[column]]
+        charts.append(Chart(title, lines(along, y, *values), file="aligned"))
     if position is not None:
-        title = f"Distance of {names[1]} from {names[0]}"
-        panels.append((title, 1.0, lambda ax: _draw_distance(ax, comparison, along)))
-        panels.append(("Paths", 1.5, paths))
-    return panels
-
-
-def _draw_distance(ax: Axes, comparison: Comparison, along: str) -> None:
-    for values, name, ink in (
-        (comparison.along_m, "along-track", MAP_INK),
-        (comparison.cross_m, "cross-track", INK),
-    ):
-        draw_line(ax, comparison.at, values, color=ink, label=name)
-    ax.axhline(0, color="0.7", lw=0.6, zorder=0)
-    _finish(ax, along, "distance [m]")
-
-
-def _finish(ax: Axes, x: str, y: str) -> None:
-    ax.margins(x=0)
-    label(ax, x, y)
-    legend_above(ax)
+        apart = [(comparison.at, part) for part in (comparison.along_m, comparison.cross_m)]
+        draw = lines(along, "distance [m]", *apart, names=("along-track", "cross-track"))
+        charts.append(Chart(f"distance of {names[1]} from {names[0]}", draw, file="distance"))
+        charts.append(Chart("paths", paths, 4.0, "paths"))
+    return charts
 
 
 def _driven(metadata: Metadata) -> str:
@@ -318,28 +359,3 @@ def _driven(metadata: Metadata) -> str:
     path, engine = metadata.get("path", "a custom path"), metadata.get("engine", "kinematic")
     seed = f"seed {metadata['seed']}" if "seed" in metadata else "recorded"
     return f"{path}, engine {engine}, {seed}"
-
-
-def _traversals_picture(both: Traversals, names: tuple[str, str]) -> Picture | None:
-    column, position = field_name(both.a, both.b), position_name(both.a, both.b)
-    if column is None or position is None:
-        return None
-    figure = new_figure(WIDTH_IN, 8.6)
-    axes = figure.subplots(4, 1, height_ratios=[1.0, 1.0, 1.0, 0.8])
-    for ax, (key, text) in zip(axes, ALIGNED.items(), strict=False):
-        comparison: Comparison = getattr(both, key)
-        for values, name, ink, width in zip(
-            comparison.fields[column], names, (INK, OTHER_INK), (1.6, 0.9), strict=True
-        ):
-            draw_line(ax, comparison.at, values / 1000, color=ink, lw=width, label=name)
-        match = next(row for row in comparison.agreements() if row.name == column)
-        shift = f" ({comparison.shift:+.3f} {comparison.unit})" if key != "recorded" else ""
-        alike = "" if match.correlation is None else f", corr. {match.correlation:.3f}"
-        x = "distance driven [m]" if comparison.align == "path" else "time [s]"
-        label(ax, x, "field [µT]", title=f"{text}{shift}: MAE {match.mae:,.0f} nT{alike}")
-        ax.margins(x=0)
-    axes[0].legend(fontsize=9, loc="best", framealpha=0.85)
-    _draw_distance(axes[3], both.recorded, "time [s]")
-    axes[3].set_title("distance between the two, by time from each start", fontsize=9, loc="right")
-    title = f"Figure 8: {column} of one path, driven twice, with and without alignment"
-    return picture(figure, title, file="figure_8")

@@ -1,22 +1,16 @@
-"""Runs: the path over the map and the readings against time, as one figure; or the path alone, for a page."""
+"""Runs: the path on the floor and what the map lacks along it; or the path alone, for a page."""
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.maps.statistics import colour_limits
 from magtwin.figures.canvas import (
-    INK,
-    MAP_INK,
-    MEASURED_INK,
-    PLAN_INK,
     POINTS,
     WIDTH_IN,
     Array,
@@ -30,8 +24,22 @@ from magtwin.figures.canvas import (
     new_figure,
     picture,
     shade,
+    zero_line,
 )
-from magtwin.figures.maps import draw_cells, mean_field_ut
+from magtwin.figures.maps import FloorPlan, draw_mean, mean_field_nt
+from magtwin.figures.style import (
+    DATA,
+    FAINT,
+    FIELD_COLOURS,
+    INK,
+    MODEL,
+    OTHER,
+    PAPER,
+    SIGNED_COLOURS,
+    SOFT,
+    styled,
+)
+from magtwin.report.verdict import Z_90
 from magtwin.run import mapped
 from magtwin.run.compare import FIELDS, POSITIONS
 from magtwin.run.figures import prediction_nt
@@ -40,15 +48,27 @@ from magtwin.run.run import Run
 MOST_OTHER = 4
 """Columns drawn of a run that has none of the usual ones."""
 
+TRAIL_SHARE = 0.995
+"""Share of the readings within the scale of a trail; its ends take the rest."""
 
-def draw_run(run: Run, field: AnomalyMap | None = None, planned: ArrayLike | None = None) -> Figure:
-    """Draw a run: the path over the map, and field, disturbance, speed and battery against time.
+DASHES: dict[str, Any] = {"ls": (0, (6, 1.2))}
+
+
+@styled
+def draw_run(
+    run: Run,
+    field: AnomalyMap | None = None,
+    planned: ArrayLike | None = None,
+    plan: FloorPlan | None = None,
+) -> Figure:
+    """Draw a run: the path, and against time what the map lacks, what was predicted of it, and the rest.
 
     Args:
         run: The run. Columns that it lacks are left out; of a run with none of them, its first four columns
             of numbers are drawn.
         field: The map below the path, as the mean over its headings. None draws a bare floor.
         planned: The planned path in world [m], shape (M, 2). None leaves it out.
+        plan: Walls, furniture and doors. None leaves them out.
 
     Returns:
         A matplotlib figure.
@@ -63,26 +83,19 @@ def draw_run(run: Run, field: AnomalyMap | None = None, planned: ArrayLike | Non
         mapped.release()
     place, panels = position_name(run), panels_of(run)
     both = place is not None and bool(panels)
-    figure = new_figure(13.5 if both else 8.0, 7.0 if len(panels) > 2 or not both else 5.5)
-    sides = figure.subfigures(1, 1 + both, squeeze=False, width_ratios=(1.15, 1)[: 1 + both])[0]
+    figure = new_figure(14.0 if both else 8.0, 8.0 if len(panels) > 3 or not both else 6.0)
+    sides = figure.subfigures(1, 1 + both, squeeze=False, width_ratios=(1.1, 1)[: 1 + both])[0]
     if place is not None:
-        known = np.isfinite(run[place][:, :2]).all(axis=1)
-        if not known.any():
-            raise InputError(f"no position is known in {place!r} of the run")
-        total = "b_total_nt" if "b_total_nt" in run else field_name(run)
-        values = run[total][known] / 1000 if total else np.full(np.count_nonzero(known), np.nan)
-        ax = sides[0].subplots()
-        ax.set_title(_title(run, run[place][known, :2]), fontsize=11)
-        draw_path(ax, run[place][known, :2], values, field, planned)
-    else:
-        sides[0].suptitle(_title(run), fontsize=11)
+        p_xy, trail = trail_of(run, place)
+        draw_path(sides[0].subplots(), p_xy, trail, field, planned, plan)
+    sides[0].suptitle(_title(run, None if place is None else p_xy), x=0.02, ha="left")
     if panels:
         heights = [panel.height for panel in panels]
         axes = sides[-1].subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
         for ax, panel in zip(axes, panels, strict=True):
             panel.draw(ax, run)
         sides[-1].align_ylabels(axes)
-        shaded = "; shaded while the LiDAR is on" if "lidar_on" in run else ""
+        shaded = "; shaded while the LiDAR is on" if "lidar_on" in run and run["lidar_on"].any() else ""
         label(axes[-1], f"time [s]{shaded}")
     elif place is None:
         raise InputError("the run has neither positions nor columns of numbers to draw")
@@ -93,16 +106,15 @@ def draw_run(run: Run, field: AnomalyMap | None = None, planned: ArrayLike | Non
 class Panel:
     """One graph of a run against time."""
 
-    title: str
     label: str
     """Name and unit of the quantity."""
 
     curves: tuple[tuple[str, Array, dict[str, Any]], ...]
-    """Name, values and style of each curve."""
+    """Name, values and look of each curve."""
 
     height: float = 1.0
     band: tuple[Array, Array] | None = None
-    """Lower and upper edge of a shaded band: two standard deviations."""
+    """Middle and half width of the band of 90 % of what is predicted."""
 
     about_zero: bool = False
     """Whether to draw a line at zero."""
@@ -110,16 +122,17 @@ class Panel:
     def draw(self, ax: Axes, run: Run) -> None:
         """Draw the curves, with a legend if there are several; shade the time while the LiDAR is on."""
         t = run["t"]
-        if self.band is not None:
-            rows = evenly(run.rows, POINTS // 2)
-            low, high = (edge[rows] for edge in self.band)
-            ax.fill_between(t[rows], low, high, color=INK, alpha=0.15, lw=0, label="± 2 sd")
         for name, values, look in self.curves:
             draw_line(ax, t, values, label=name, **look)
+        if self.band is not None:
+            rows = evenly(run.rows, POINTS // 2)
+            middle, half = (values[rows] for values in self.band)
+            look = {"color": MODEL, "alpha": 0.22, "lw": 0, "label": "its 90 % band", "zorder": 1.9}
+            ax.fill_between(t[rows], middle - half, middle + half, **look)
         if self.about_zero:
-            ax.axhline(0, color="0.7", lw=0.6, zorder=0)
-        if len(self.curves) > 1 or self.band is not None:
-            legend_above(ax, 4)
+            zero_line(ax)
+        if len(self.curves) > 1 or self.band is not None or self.about_zero:
+            legend_above(ax)
         ax.margins(x=0)
         label(ax, y=self.label)
         if "lidar_on" in run:
@@ -128,89 +141,137 @@ class Panel:
 
 def panels_of(run: Run) -> list[Panel]:
     """The graphs that a run has columns for; of a run with none of the usual ones, its first columns."""
-    panels = []
-    style: dict[str, dict[str, Any]] = {
-        "b_measured_nt": {"color": MEASURED_INK, "lw": 1.4},
-        "b_map_nt": {"color": MAP_INK},
-        "b_total_nt": {"color": INK},
-    }
-    names = [name for name in style if _has(run, name)]
-    other = field_name(run)
-    names = names or ([other] if other else [])
-    if names:
-        curves: tuple[tuple[str, Array, dict[str, Any]], ...] = tuple(
-            (name.removeprefix("b_").removesuffix("_nt"), run[name] / 1000, style.get(name, {"color": INK}))
-            for name in names
-        )
-        band = None
-        if _has(run, "b_sd_nt", "b_total_nt"):
-            low, high = ((prediction_nt(run) + k * run["b_sd_nt"]) / 1000 for k in (-2, 2))
-            band = low, high
-        text = "field\n[µT]" if len(curves) > 1 else f"{curves[0][0]} field\n[µT]"
-        panels.append(Panel("Field", text, curves, 2.0, band))
-    curves = ()
-    if _has(run, "b_disturbance_nt"):
-        curves += (("disturbance", run["b_disturbance_nt"], {"color": MAP_INK}),)
-    if _has(run, "b_measured_nt", "b_truth_nt"):
-        error = run["b_measured_nt"] - run["b_truth_nt"]
-        curves += (("error (measured - exact)", error, {"color": INK}),)
-    if curves:
-        words = [name.partition(" ")[0] for name, _, _ in curves]
-        title = " and ".join(words).capitalize()
-        panels.append(Panel(title, f"{', '.join(words)}\n[nT]", curves, 2.0, about_zero=True))
-    speeds = {"v_cmd": ("commanded", MAP_INK), "v_base": ("driven", INK)}
-    if not _has(run, "v_base"):
-        speeds["odom_v"] = ("odometry", INK)
-    curves = tuple(
-        (name, run[key] if run[key].ndim == 1 else run[key][:, 0], {"color": ink})
-        for key, (name, ink) in speeds.items()
-        if _has(run, key)
+    panels = _residuals(run)
+    grey, data, model = ({"color": ink} for ink in (SOFT, DATA, MODEL))
+    read = next(
+        (name for name in ("b_measured_nt", "b_total_nt", field_name(run)) if name and _has(run, name)), ""
     )
-    if curves:
-        panels.append(Panel("Forward speed", "speed\n[m/s]", curves))
-    if _has(run, "battery_v"):
-        shaded = "lidar_on" in run and run["lidar_on"].any()
-        title = "Battery voltage" + ("; shaded in all charts while the LiDAR is on" if shaded else "")
-        panels.append(Panel(title, "battery\n[V]", (("battery", run["battery_v"], {"color": INK}),)))
+    fields = {
+        "reading" if read == "b_measured_nt" else read: (read, data),
+        "map": ("b_map_nt", model | DASHES),
+    }
+    speeds = {"driven": ("v_base", data), "commanded": ("v_cmd", model | DASHES)}
+    if not _has(run, "v_base"):
+        speeds["odometry"] = ("odom_v", grey)
+    for text, height, curves in (
+        ("field\n[nT]", 1.5, fields),
+        ("speed\n[m/s]", 0.8, speeds),
+        ("battery\n[V]", 0.8, {"battery": ("battery_v", data)}),
+    ):
+        drawn = tuple(
+            (name, run[key] if run[key].ndim == 1 else run[key][:, 0], look)
+            for name, (key, look) in curves.items()
+            if key and _has(run, key)
+        )
+        if drawn:
+            panels.append(Panel(text, drawn, height))
     if panels or position_name(run) is not None:
         return panels
     others = [name for name, values in run.items() if values.ndim == 1 and values.dtype.kind in "fiub"]
     return [
-        Panel(name, f"{name}\n[{run.spec(name).unit or '-'}]", ((name, run[name], {"color": INK}),))
+        Panel(f"{name}\n[{run.spec(name).unit or '-'}]", ((name, run[name], data),))
         for name in [name for name in others if name != "t"][:MOST_OTHER]
     ]
 
 
+def _residuals(run: Run) -> list[Panel]:
+    """What the map lacks, measured and predicted, and the error of the prediction, each about zero."""
+    if not _has(run, "b_map_nt"):
+        return []
+    field, grey = run["b_map_nt"], {"color": FAINT}
+    read = next((name for name in ("b_measured_nt", "b_total_nt") if _has(run, name)), "")
+    if not read:
+        return []
+    lacks: list[tuple[str, Array, dict[str, Any]]] = [("reading − map", run[read] - field, grey)]
+    exact = run["b_truth_nt"] if _has(run, "b_truth_nt") else None
+    judge, name = (run[read], "reading") if exact is None else (exact, "exact")
+    told = prediction_nt(run) if "b_total_nt" in run else field
+    error = told - judge
+    if not (np.nan_to_num(told - field).any() and np.nan_to_num(error).any()):
+        if exact is None:
+            return [Panel("what the map\nlacks [nT]", tuple(lacks), 2.0, None, about_zero=True)]
+        lacks.append(("exact − map", exact - field, {"color": DATA}))  # nothing is predicted
+        error, sd, look, title = run[read] - exact, None, {"color": DATA}, "reading − exact"
+    else:
+        lacks.append(("predicted", told - field, {"color": MODEL, "lw": 1.6}))
+        sd = Z_90 * run["b_sd_nt"] if _has(run, "b_sd_nt") else None
+        look, title = {"color": MODEL}, f"prediction − {name}"
+    title += f": mean size {np.nanmean(np.abs(error)):,.0f} nT" if np.isfinite(error).any() else ""
+    middle = None if sd is None else (told - field, sd), None if sd is None else (0 * sd, sd)
+    return [
+        Panel("what the map\nlacks [nT]", tuple(lacks), 2.4, middle[0], about_zero=True),
+        Panel("error\n[nT]", ((title, error, look),), 1.5, middle[1], about_zero=True),
+    ]
+
+
+def trail_of(run: Run, place: str) -> tuple[Array, tuple[Array, str]]:
+    """A path's known points [m], shape (N, 2); and there the reading, less the map if known, with its name.
+
+    Raises:
+        InputError: No position is known.
+    """
+    known = np.isfinite(run[place][:, :2]).all(axis=1)
+    if not known.any():
+        raise InputError(f"no position is known in {place!r} of the run")
+    name = field_name(run)
+    if name is None:
+        values, text = np.full(run.rows, np.nan), ""
+    elif _has(run, "b_map_nt") and name != "b_map_nt":
+        values, text = run[name] - run["b_map_nt"], "reading − map, along the path [nT]"
+    else:
+        values, text = run[name], f"{name.removesuffix('_nt')} along the path [nT]"
+    return run[place][known, :2], (values[known], text)
+
+
 def draw_path(
-    ax: Axes, p_xy: Array, total_ut: Array, field: AnomalyMap | None, planned: ArrayLike | None
+    ax: Axes,
+    p_xy: Array,
+    trail: tuple[Array, str],
+    field: AnomalyMap | None,
+    planned: ArrayLike | None,
+    plan: FloorPlan | None = None,
 ) -> None:
-    """Draw a path over the map, coloured by the field along it.
+    """Draw a path over the map, coloured along it.
 
     Args:
         ax: Where to draw.
         p_xy: Path in world [m], shape (N, 2).
-        total_ut: Field along it [µT], shape (N,).
+        trail: Values along it [nT], shape (N,), and their name; a difference from the map has a scale that
+            is even about zero, other readings have the scale of the map.
         field: The map below it, or None.
         planned: The planned path in world [m], shape (M, 2), or None.
+        plan: Walls, furniture and doors, or None.
     """
-    flat = {"orientation": "horizontal", "aspect": 40}
+    values, name = trail
+    signed, size = "−" in name, np.abs(values[np.isfinite(values)])
+    shown = values if field is None else mean_field_nt(field)
+    limits = (float(np.nanmin(shown)), float(np.nanmax(shown))) if np.isfinite(shown).any() else (0.0, 1.0)
     if field is not None:
-        known = mean_field_ut(field)
-        paper = LinearSegmentedColormap.from_list("paper", ["white", "0.4"])  # lighter than the path
-        low, high = colour_limits(known)
-        mesh = draw_cells(ax, field.x_m, field.y_m, known, paper, vmin=low, vmax=high)
-        colour_bar(ax.figure, mesh, ax, "map, mean over headings [µT]", **flat)
-    for ink, width in ((INK, 5.4), ("white", 4.5)):  # one of the two edges differs from the map
+        limits = draw_mean(ax, field, quiet=signed)
+    if plan is not None:
+        plan.draw(ax)
+    elif field is None:
+        ax.margins(0.08)
+    for ink, width in ((INK, 6.0), (PAPER, 5.0)):  # one of the two edges differs from the map
         ax.plot(*p_xy[evenly(len(p_xy), 3000)].T, color=ink, lw=width, solid_capstyle="round")
-    line = coloured_line(ax, p_xy, total_ut, colour_limits(total_ut, 0), "viridis", 3)
+    if signed:
+        reach = float(np.quantile(size, TRAIL_SHARE)) if len(size) else 1.0
+        limits = (-reach or -1.0, reach or 1.0)
+    colours = SIGNED_COLOURS if signed else FIELD_COLOURS
+    line = coloured_line(ax, p_xy, values, limits, colours, 3.4)
     if planned is not None:
-        plan = np.asarray(planned, float)[:, :2]
-        ax.plot(*plan.T, color=PLAN_INK, lw=0.8, ls=(0, (4, 3)), zorder=4, label="planned")
-    ax.plot(*p_xy[0], marker="o", ms=7, mfc="white", mec=INK, ls="", zorder=5, label="start")
-    colour_bar(ax.figure, line, ax, "total field along the path [µT]", **flat)
+        points = np.asarray(planned, float)[:, :2]
+        ax.plot(*points.T, color=OTHER, lw=1.0, ls=(0, (4, 3)), zorder=4, label="planned")
+    ax.plot(*p_xy[0], marker="o", ms=7, mfc=PAPER, mec=INK, ls="", zorder=5, label="start")
+    if name and (signed or field is None):
+        ends = bool(np.nanmin(values) < limits[0]), bool(np.nanmax(values) > limits[1])
+        extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(ends, "neither")
+        colour_bar(ax.figure, line, ax, name, below=True, extend=extend)
     ax.set_aspect("equal")
     label(ax, "x [m]", "y [m]")
-    ax.legend(loc="upper right", fontsize=8, framealpha=0.85)
+    handles, names = ax.get_legend_handles_labels()
+    keys = {} if plan is None else plan.keys()
+    legend_above(ax, 5, handles=[*handles, *keys.values()], labels=[*names, *keys])
 
 
 def field_name(*runs: Run) -> str | None:
@@ -227,34 +288,40 @@ def _has(run: Run, *names: str) -> bool:
     return all(name in run and np.isfinite(run[name]).any() for name in names)
 
 
-def path_picture(run: Run, field: AnomalyMap | None, planned: ArrayLike | None) -> Picture | None:
+@styled
+def path_picture(
+    run: Run,
+    field: AnomalyMap | None,
+    planned: ArrayLike | None,
+    plan: FloorPlan | None = None,
+    kind: str = "png",
+) -> Picture | None:
     """The path of a run over its map, or over a bare floor; None if its places or readings are unknown.
 
     Args:
         run: The run.
         field: The map below the path, or None.
         planned: The planned path in world [m], shape (M, 2), or None.
+        plan: Walls, furniture and doors, or None.
+        kind: "png" or "svg".
     """
     position, column = position_name(run), field_name(run)
-    if position is None or column is None:
+    if position is None or column is None or np.isfinite(run[position][:, :2]).all(axis=1).sum() < 2:
         return None
-    known = np.isfinite(run[position][:, :2]).all(axis=1)
-    if np.count_nonzero(known) < 2:
-        return None
-    p_xy = run[position][known, :2]
+    p_xy, trail = trail_of(run, position)
     wide, tall = np.ptp(p_xy, axis=0) if field is None else np.ptp(np.reshape(field.extent, (2, 2)), axis=1)
     height = float(np.clip((WIDTH_IN - 0.8) * tall / max(wide, 1e-9), 1.5, 6.0))
     figure = new_figure(WIDTH_IN, height + (1.9 if field is not None else 1.2))
-    draw_path(figure.subplots(), p_xy, run[column][known] / 1000, field, planned)
+    draw_path(figure.subplots(), p_xy, trail, field, planned, plan)
     over = "the path" if field is None else f"the path over the map {field.name}"
-    alt = f"{over}, coloured by the field along it"
-    return picture(figure, f"Path driven, coloured by {column}", alt=alt, kind="png")
+    what = trail[1].partition(",")[0].partition(" along")[0]
+    return picture(figure, f"Path driven, coloured by {what}", alt=f"{over}, coloured by {what}", kind=kind)
 
 
 def _title(run: Run, p_xy: Array | None = None) -> str:
-    """Scene, path and network of a run, and its size."""
+    """Scene, path and network of a run, its size, and its verdict."""
     names = [str(run.metadata[key]) for key in ("scene", "path", "network") if run.metadata.get(key)]
     size = [f"{run.rows:,} readings", f"{run.duration_s:.1f} s"]
     if p_xy is not None:
         size.append(f"{np.linalg.norm(np.diff(p_xy, axis=0), axis=1).sum():.1f} m")
-    return f"{', '.join(names) or 'run'}\n{', '.join(size)}"
+    return f"{', '.join(names) or 'run'}: {', '.join(size)}"
