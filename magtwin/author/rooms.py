@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from magtwin.author.furniture import FurnitureTable, check_stands
 from magtwin.author.robot import RobotSettings
-from magtwin.author.room import check_name, lab_of
+from magtwin.author.room import asset_named, check_name, lab_of
 from magtwin.author.scene import check_names, check_things
-from magtwin.author.scene_file import EarthTable, about
+from magtwin.author.scene_file import EarthTable
 from magtwin.author.tables import table_of, table_of_robot, toml_text
 from magtwin.author.walls import DoorTable, WallTable, lab_with_walls
 from magtwin.errors import InputError, hint
@@ -45,6 +45,9 @@ Point = Sequence[float]
 
 EARTH = {"latitude_deg": 29.65, "longitude_deg": -82.35, "height_m": 50.0, "date": "2026-11-21"}
 """Place and day of a room that names none: Gainesville, Florida, as in `magtwin new`."""
+
+FAR_M = 100.0
+"""A place further from the origin than this is probably not in metres [m]."""
 
 DESCRIPTIONS = (".urdf", ".xacro", ".xml")
 
@@ -232,8 +235,11 @@ class Room(Summarized):
         values |= {"faces": faces, "scale": None if scale == 1.0 else scale}
         what = f"{kind} {values['name']!r}"
         table = from_values(FurnitureTable, values, what)
-        with about(what):
+        try:
             check_stands(table.spec(self.table["seed"]), self._lab())
+        except InputError as error:
+            far = max(map(abs, table.p_world)) > FAR_M
+            raise InputError(f"{what}: {error}{'; lengths are in metres' if far else ''}") from error
         return self._adding("furniture", values)
 
     def desk(self, at: Point, yaw: float = 0.0, **more: Unpack[PieceKeys]) -> "Room":
@@ -303,8 +309,12 @@ class Room(Summarized):
             InputError: A value has the wrong type or size.
         """
         values: dict[str, Any] = {"name": self._free("source", "magnet"), **more, "p_world": _place(at)}
-        if any(m_world):
+        if any(plain(m_world)):
             values["m_world"] = m_world
+        elif not {"magnetization", "susceptibility"} & set(more):
+            raise InputError(
+                "magnet: needs m_world, its moment [A m2]; or shape, size_m and magnetization [A/m]"
+            )
         from_values(SourceSpec, values, f"magnet {values['name']!r}")
         return self._adding("source", values)
 
@@ -410,6 +420,7 @@ class Room(Summarized):
             values = {"urdf": existing(robot, "robot description"), "conversion": {"profile": "diff-drive"}}
         else:
             bare = Path(robot).suffix == "" and Path(robot).name == str(robot)
+            asset_named(Path(robot), str(robot), "robot")
             values = {"asset": str(robot) if bare else existing(robot, "robot asset")}
         if isinstance(magnetometer, str):
             link, _, place = magnetometer.partition(":")
@@ -484,11 +495,11 @@ class Room(Summarized):
         """The room without what stands in it, and with its walls."""
         table, where = self.table, f"room {self.table['name']!r}"
         lab = lab_of(from_values(LabSpec, table["lab"], where), table, where, None)
-        parts = [
+        parts: list[Any] = [
             [from_values(cls, each, f"{name} {each['name']!r}") for each in table.get(name, ())]
             for name, cls in (("wall", WallTable), ("door", DoorTable), ("window", Window))
         ]
-        return lab_with_walls(lab, *parts, where, seed=table["seed"])  # type: ignore[arg-type]
+        return lab_with_walls(lab, parts[0], parts[1], parts[2], where, seed=table["seed"])
 
     def _opening(
         self, section: str, cls: type, at_m: float, wall: str | None, more: Mapping[str, Any]
@@ -564,7 +575,7 @@ def _set(spec: Any, way: Sequence[str], value: Any, whole: str) -> Any:
         return tuple(
             _set(each, rest, value, whole) if this else each for each, this in zip(spec, chosen, strict=True)
         )
-    if not is_dataclass(spec):
+    if not is_dataclass(spec) or isinstance(spec, type):
         raise InputError(f"{whole}: there is nothing below {spec!r}")
     if name == "yaw" and hasattr(spec, "q_world_xyzw"):
         name, value = "q_world_xyzw", tuple(quat_from_yaw(float(value)).tolist())

@@ -81,7 +81,9 @@ def draw_scene(twin: Twin) -> Figure:
     ax.set_aspect("equal")
     plan.draw(ax)
     for piece in scene.furniture[:MOST_LABELS]:
-        ax.text(*piece.p_world[:2], piece.name, ha="center", va="center", fontsize=8, zorder=6)
+        box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.7}
+        middle = {"ha": "center", "va": "center", "fontsize": 8, "zorder": 6}
+        ax.text(*piece.p_world[:2], piece.name, bbox=box, **middle)
     for source in scene.sources[:MOST_LABELS]:
         ax.plot(*source.p_world[:2], marker="x", ms=6, mec=BOUND, ls="", zorder=5)
     for placed in scene.robots:

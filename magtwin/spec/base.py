@@ -66,7 +66,7 @@ class Spec:
     """Base class of all specs: every number is one and finite. Lists and arrays become tuples."""
 
     def __post_init__(self) -> None:
-        kinds = _number_fields(type(self))
+        kinds = _number_fields(type(self))  # type: ignore[arg-type]
         for f in fields(self):  # type: ignore[arg-type]
             value = getattr(self, f.name)
             if f.name in kinds and not _are_numbers(value, *kinds[f.name]):

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
-    from magtwin.author.rooms import Room
+    from magtwin.author import rooms
     from magtwin.twin.twin import Place
 
 NOTED_NT = 50.0
@@ -46,7 +46,7 @@ def new_workshop() -> str:
 
 
 def scene_from_toml(
-    path: "str | FilePath | Room",
+    path: "str | FilePath | rooms.Room",
     *,
     map_layer: str | FilePath | None = None,
     network: str | FilePath | None = None,

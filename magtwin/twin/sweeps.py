@@ -251,8 +251,8 @@ class _Finish:
         }.values():
             those = [n for n, own in enumerate(twins) if own.magnetometer is predictor]
             options: Any = {"outside": flagged, "known": [trained_on(twins[n]) for n in those]}
-            for n, read in zip(those, predictor.read([rows[n] for n in those], **options), strict=True):
-                reads[n] = read
+            for n, made in zip(those, predictor.read([rows[n] for n in those], **options), strict=True):
+                reads[n] = made
         runs = []
         for job, each, read in zip(jobs, sensed, reads, strict=True):
             own, config = known[id(job.scene)]

@@ -86,14 +86,17 @@ class OwnModule(Predictor):
         x = self.inputs.checked(x)
         z = np.zeros((-(-len(x) // ROWS) * ROWS, len(self.features)), np.float32)
         z[: len(x)] = self.inputs.scaled(x)
+        means, sds = [np.zeros(0)], [np.zeros(0)]
         with torch.inference_mode(), _one_thread():
-            parts = [outputs(self.net, block, self.name) for block in torch.from_numpy(z).split(ROWS)]
-        mean = np.concatenate([part[0].double().numpy() for part in parts] or [np.zeros(0)])[: len(x)]
+            for block in torch.from_numpy(z).split(ROWS):
+                mean_of, log_sd = outputs(self.net, block, self.name)
+                means.append(mean_of.double().numpy())
+                sds.append(np.ones(ROWS) if log_sd is None else log_sd.double().exp().numpy())
+        mean = np.concatenate(means)[: len(x)]
         mean = np.where(np.isfinite(x).all(axis=1), self.y_mean + self.y_scale * mean, np.nan)
         if self.sd_factor is None:
             return mean, np.full(len(x), self.residual_sd_nt)
-        sd = np.concatenate([part[1].double().exp().numpy() for part in parts] or [np.zeros(0)])[: len(x)]
-        return mean, self.sd_factor * self.y_scale * sd
+        return mean, self.sd_factor * self.y_scale * np.concatenate(sds)[: len(x)]
 
     def tensors(self) -> dict[str, NDArray[Any]]:
         """Scaler and ranges, the scale of the labels, and the module's state."""
