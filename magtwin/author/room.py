@@ -16,7 +16,7 @@ from magtwin.errors import InputError
 from magtwin.files.file import shipped
 from magtwin.files.settings import refused_at
 from magtwin.spec.furniture import FurnitureSpec
-from magtwin.spec.lab import LabSpec
+from magtwin.spec.lab import LabSpec, on_polygon
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.robot import PlacedRobot
 from magtwin.usd.lab.furniture import FURNITURE, define_furniture
@@ -46,34 +46,44 @@ def check_start(placed: PlacedRobot, lab: LabSpec, obstacles: Obstacles) -> None
         raise InputError(
             f"start's yaw must be in radians, at most 2 pi; {yaw:g} deg are {math.radians(yaw):.4f} rad"
         )
-    inside = [k for k, name in enumerate(obstacles.names) if name.startswith(str(FURNITURE))]
+    every = bool(lab.floor or lab.walls)
+    inside = [k for k, name in enumerate(obstacles.names) if every or name.startswith(str(FURNITURE))]
     standing = Obstacles(
         tuple(obstacles.names[k] for k in inside), tuple(obstacles.outlines[k] for k in inside)
     )
     distance, which = standing.clearance([[x, y]], reach_m=radius)
-    half = np.array(lab.floor_m) / 2
+    corners = np.array(lab.corners)
+    half, middle = np.ptp(corners, axis=0) / 2, (corners.max(axis=0) + corners.min(axis=0)) / 2
     if distance[0] < radius:
         piece = standing.names[which[0]].split("/")[-2]
         what = f"in {piece!r}"
-    elif np.any(np.abs((x, y)) > half):
-        what = f"off the floor of {lab.floor_m[0]:g} x {lab.floor_m[1]:g} m"
+    elif not on_polygon(np.array([[x, y]]), lab.corners)[0]:
+        what = f"off the floor of {2 * half[0]:g} x {2 * half[1]:g} m"
     else:
         return
-    free = _nearest_free(x, y, half - radius, standing, radius)
+    free = _nearest_free(x, y, middle, half - radius, standing, lab, radius)
     hint = f"start = [{free[0]:.2f}, {free[1]:.2f}, 0.0] is free" if free else "there is no free place"
     raise InputError(f"start ({x:g}, {y:g}) of robot {placed.robot.name!r} is {what}; {hint}")
 
 
 def _nearest_free(
-    x: float, y: float, reach: np.ndarray, standing: Obstacles, radius: float
+    x: float,
+    y: float,
+    middle: np.ndarray,
+    reach: np.ndarray,
+    standing: Obstacles,
+    lab: LabSpec,
+    radius: float,
 ) -> tuple[float, float] | None:
     """The free place nearest to a point, on a raster of about 5 cm."""
     if min(reach) <= 0:
         return None
-    axes = [np.linspace(-r, r, min(400, max(3, int(r / 0.025)))) for r in reach]
+    axes = [
+        m + np.linspace(-r, r, min(400, max(3, int(r / 0.025)))) for m, r in zip(middle, reach, strict=True)
+    ]
     at = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     distance, _ = standing.clearance(at, reach_m=radius + 0.05)
-    free = at[distance >= radius + 0.05]
+    free = at[(distance >= radius + 0.05) & on_polygon(at, lab.corners)]
     if not len(free):
         return None
     nearest = free[np.argmin(np.hypot(free[:, 0] - x, free[:, 1] - y))]

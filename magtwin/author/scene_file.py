@@ -203,10 +203,15 @@ def scene_from_toml(
         if layer is None and (given.survey is None or given.survey.height_m is None):
             check_above_floor(made, where)
         drives = _path(robot_table.path, Path(path).parent, where)
-        of_robot = robot_table.start is not None or not (alone or (number == 0 and "start" in table))
+        cut = bool(lab.floor or lab.walls)  # the origin need not be free
+        of_robot = robot_table.start is not None or not (
+            (alone and not cut) or (number == 0 and "start" in table)
+        )
         start = robot_table.start or (ZERO3 if of_robot else given.start)
-        if robot_table.start is None and of_robot and drives not in ("", "random"):
-            way = path_in(Room(lab.floor_m, made.footprint_radius_m, standing), drives)  # not in each other
+        if robot_table.start is None and of_robot and (drives or cut) and drives != "random":
+            corners = lab.corners if lab.floor else ()
+            room = Room(lab.floor_m, made.footprint_radius_m, standing, corners)
+            way = path_in(room, drives or "figure8")  # not in each other
             start = float(way.p_xy[0, 0]), float(way.p_xy[0, 1]), float(way.heading(0.0))
         robots.append(PlacedRobot(robot=made, start=start, path=drives))
         with _at(path, "start", **({"section": "robot", "number": number} if of_robot else {})):

@@ -5,12 +5,11 @@ import sys
 from importlib import import_module
 
 from magtwin.cli import app as application
+from magtwin.cli.words import as_of_today
 
 MODULES = {
     "bench": ("bench",),
-    "calibrate": ("learn.calibrate",),
     "compare": ("runs.report",),
-    "compensate": ("learn.compensate",),
     "completion": ("doctor",),
     "convert": ("runs.file",),
     "dataset": ("learn.dataset",),
@@ -20,13 +19,12 @@ MODULES = {
     "evaluate": ("learn.evaluate",),
     "export": ("scenes.export",),
     "fetch": ("runs.file",),
-    "film": ("runs.picture",),
     "info": ("runs.file",),
     "localize": ("localize",),
     "map": ("maps.fit", "maps.look"),
-    "network": ("learn.network",),
+    "model": ("learn.model", "learn.compensate"),
     "new": ("scenes.scene",),
-    "picture": ("runs.picture",),
+    "plot": ("runs.plot",),
     "report": ("runs.report",),
     "reproduce": ("runs.report",),
     "robot": ("scenes.robot",),
@@ -48,7 +46,7 @@ GARBAGE = 50_000
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the `magtwin` command; `arguments` default to those of the command line."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    arguments = as_of_today(sys.argv[1:] if arguments is None else arguments)
     gc.set_threshold(GARBAGE)
     name = arguments[0] if arguments else ""
     load(name if name in MODULES and name != "completion" else None)

@@ -44,6 +44,7 @@ from magtwin.run import mapped
 from magtwin.run.compare import FIELDS, POSITIONS
 from magtwin.run.figures import prediction_nt
 from magtwin.run.run import Run
+from magtwin.run.summary import swept
 
 MOST_OTHER = 4
 """Columns drawn of a run that has none of the usual ones."""
@@ -324,4 +325,5 @@ def _title(run: Run, p_xy: Array | None = None) -> str:
     size = [f"{run.rows:,} readings", f"{run.duration_s:.1f} s"]
     if p_xy is not None:
         size.append(f"{np.linalg.norm(np.diff(p_xy, axis=0), axis=1).sum():.1f} m")
-    return f"{', '.join(names) or 'run'}: {', '.join(size)}"
+    floor = swept(run.metadata).partition(",")[0]
+    return f"{', '.join(names) or 'run'}: {', '.join(size)}{floor and chr(10) + floor}"

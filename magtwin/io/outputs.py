@@ -18,8 +18,9 @@ from magtwin.path import CASES, PATHS, read_path_csv
 from magtwin.path import Path as Planned
 from magtwin.path.room import FLOOR_M
 from magtwin.run.run import Run
+from magtwin.run.summary import swept
 from magtwin.sim.motion.commands import Commands, read_commands
-from magtwin.sim.motion.drive_input import drive_input
+from magtwin.sim.motion.drive_input import drive_input, path_metadata
 from magtwin.spec.plant import PlantSpec
 from magtwin.twin import Session, Twin, in_session, open_twin, room_of, scan, simulate, with_plant
 
@@ -108,6 +109,8 @@ def drive(
     if planned is not None and planned.placing:
         how = _placing(planned.placing, named=path in (*PATHS, *CASES))
         report(f"Path {planned.name} is {how} to fit this floor and what stands on it")
+    if planned is not None and (text := swept(path_metadata(planned))):
+        report(f"Path {planned.name}: {text}")
     if isinstance(what, Commands) and (text := what.beyond(twin.scene.robot.drive)):
         report(text)
     report(f"Driving {getattr(what, 'name', 'random' if what == 'random' else 'as recorded')}")

@@ -13,6 +13,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.io.formats import read_run, write_run
 from magtwin.path import CASES, PATHS, Path, path_named, read_path_csv
+from magtwin.path.room import COVERAGE
 from magtwin.report.report import Figure, Report
 from magtwin.run.run import COLUMNS, Run
 from magtwin.sim.motion.drive_input import path_metadata
@@ -259,7 +260,7 @@ def _driven(run: Run, near: str | FilePath | None) -> Any:
     if {"replay_sha256", "commands_sha256"} & metadata.keys():
         text = "which is in no file; it cannot be reproduced from its metadata"
         raise InputError(f"the run drove {name!r}, {text}")
-    if name == "random":
+    if name in ("random", COVERAGE):  # planned for the room
         return name
     if name not in PATHS and name not in CASES:
         raise InputError(f"the run drove the path {name!r}, which is in no file; it cannot be reproduced")

@@ -18,7 +18,7 @@ from magtwin.path.curves import (
 )
 from magtwin.path.points import path_of_points, read_path_csv, resolve_path
 from magtwin.path.polyline import Path
-from magtwin.path.room import Room, check_clear, check_on_floor, fit_path, path_in
+from magtwin.path.room import Room, check_clear, check_on_floor, coverage, fit_path, path_in
 
 __all__ = [
     "CASES",
@@ -28,6 +28,7 @@ __all__ = [
     "check_clear",
     "check_on_floor",
     "continuous_cycle",
+    "coverage",
     "curvilinear",
     "curvilinear_2",
     "fast_sine",

@@ -27,6 +27,8 @@ class Path(Summarized):
     file: str = ""  # File that it was read from, or ""
     # Scale in x and y, then shift in x and y [m], which fitted the path to its floor; () means none
     placing: tuple[float, ...] = ()
+    # Share of the free floor that it sweeps, of a path that was planned for or scaled to a room
+    swept: float | None = None
     s: Array = field(init=False, repr=False)  # Arc length at each point, from 0 [m], shape (N,)
 
     def __post_init__(self) -> None:

@@ -1,17 +1,22 @@
 """The room of a path: checks on floor and obstacles, and fitting a path to them."""
 
+import functools
 import math
 import os
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, MismatchWarning
+from magtwin.path.coverage import cover
 from magtwin.path.curves import CASES, PATHS, path_named
 from magtwin.path.points import resolve_path
 from magtwin.path.polyline import Path
+from magtwin.spec.base import Vec2
+from magtwin.spec.lab import on_polygon
 from magtwin.spec.obstacles import Obstacles
 
 Array = NDArray[np.float64]
@@ -25,6 +30,13 @@ MOST_CELLS = 400_000  # Most cells of that raster
 # Sizes to try, as fractions of the size that fits the empty floor
 SHRINK = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)
 LEAST_SCALE = 0.1  # Below this scale, a path that is too large is taken for one in another unit
+COVERAGE = "coverage"  # Name of the path that is planned for a room
+STRIP_M = 0.5  # Distance between strips of that path [m]
+PLAN_STEP_M = 0.05  # Spacing of the raster on which it is planned [m]
+FENCE_M = 0.001  # Thickness of the border of a floor with corners [m]
+SWEPT = 0.8  # Least share of the free floor around a scaled path that is not told of
+FEW_CELLS = 4_000  # Cells of a raster of which only shares are told
+LITTLE_M2 = 0.1  # A smaller part of the free floor is not told of [m2]
 SHIFTS = 13  # Positions to try along each axis for each size
 
 
@@ -35,12 +47,26 @@ class Room:
     floor_m: tuple[float, float]  # Extent of the floor in x and y, centred on the world's origin [m]
     footprint_radius_m: float  # Radius of the robot [m]
     obstacles: Obstacles  # Obstacles in the room
+    corners: tuple[Vec2, ...] = ()  # Corners of the floor [m], counter-clockwise; () for the rectangle
+
+    @functools.cached_property
+    def standing(self) -> Obstacles:
+        """The obstacles, and the border of a floor with corners."""
+        if not self.corners:
+            return self.obstacles
+        sides = zip(self.corners, (*self.corners[1:], self.corners[0]), strict=True)
+        fence = [_fence(*side) for side in sides]
+        names = [f"the border of the floor, edge_{k}" for k in range(len(fence))]
+        return Obstacles((*self.obstacles.names, *names), (*self.obstacles.outlines, *fence))
 
     def refusal(self, path: Path) -> InputError | None:
         """The error if the robot cannot drive the path here; None if it can."""
         try:
-            check_on_floor(path, self.floor_m, self.footprint_radius_m)
-            check_clear(path, self.obstacles, self.footprint_radius_m)
+            if self.corners:
+                self._check_inside(path)
+            else:
+                check_on_floor(path, self.floor_m, self.footprint_radius_m)
+            check_clear(path, self.standing, self.footprint_radius_m)
         except InputError as error:
             return error
         return None
@@ -48,7 +74,34 @@ class Room:
     @property
     def reach_m(self) -> Array:
         """Largest |x| and |y| that the robot's centre can have [m], shape (2,)."""
-        return np.asarray(self.floor_m) / 2 - self.footprint_radius_m
+        return self.half_m - self.footprint_radius_m
+
+    @property
+    def half_m(self) -> Array:
+        """Half the size of the floor, or of the rectangle around its corners, in x and y [m], shape (2,)."""
+        return np.ptp(self.corners, axis=0) / 2 if self.corners else np.asarray(self.floor_m) / 2
+
+    @property
+    def middle_m(self) -> Array:
+        """Its middle in world [m], shape (2,)."""
+        return np.asarray(self.corners).min(axis=0) + self.half_m if self.corners else np.zeros(2)
+
+    def _check_inside(self, path: Path) -> None:
+        outside = np.flatnonzero(~on_polygon(path.p_xy, self.corners))
+        if len(outside):
+            i = int(outside[0])
+            x, y = path.p_xy[i]
+            raise InputError(
+                f"path {path.name} leaves the floor at point {i + 1} of {len(path.p_xy)}, ({x:.3f}, {y:.3f}) "
+                f"m, outside its {len(self.corners)} corners; give `fit=True`, or move its points"
+            )
+
+
+def _fence(a: Vec2, b: Vec2) -> Array:
+    """Outline of a thin wall outside the side of a floor from a to b [m], shape (4, 2)."""
+    p, q = np.asarray(a), np.asarray(b)
+    out = np.array([q[1] - p[1], p[0] - q[0]]) * FENCE_M / math.dist(a, b)
+    return np.array([p, q, q + out, p + out])
 
 
 def path_in(room: Room, path: str | os.PathLike[str]) -> Path:
@@ -67,13 +120,19 @@ def path_in(room: Room, path: str | os.PathLike[str]) -> Path:
     text = os.fspath(path)
     if text not in PATHS and text not in CASES:
         return resolve_path(FilePath(text) if isinstance(path, FilePath) else text)
+    if text == COVERAGE:
+        return _covering(room)
     named = path_named(text)
-    if tuple(room.floor_m) == FLOOR_M and room.refusal(named) is None:
+    if tuple(room.floor_m) == FLOOR_M and not room.corners and room.refusal(named) is None:
         return named
     made_for = np.asarray(FLOOR_M) / 2 - RADIUS_M
     if min(room.reach_m) <= 0:
         raise InputError(f"path {named.name} does not fit: {_too_small(room)}")
-    return _placed(named, room, room.reach_m / made_for, each_way=True)
+    whole = room.reach_m / made_for
+    placed = _placed(named, room, whole, each_way=True)
+    if not room.corners and placed.placing == (*whole.tolist(), 0.0, 0.0):
+        return placed  # as large as the floor
+    return replace(placed, swept=_swept(placed, named, room))
 
 
 def fit_path(path: Path, room: Room) -> Path:
@@ -164,7 +223,7 @@ def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> 
 
 
 def _too_small(room: Room) -> str:
-    x, y = room.floor_m
+    x, y = 2 * room.half_m
     return f"the floor of {x:g} x {y:g} m is no wider than a robot of radius {room.footprint_radius_m:g} m"
 
 
@@ -180,9 +239,9 @@ def _placed(path: Path, room: Room, whole: Array, *, each_way: bool) -> Path:
             scale = whole * share
             slack = np.maximum(room.reach_m - half * scale - clear, 0.0)
             start = middle * scale if each_way else middle
-            shifts = _shifts(np.clip(start, -slack, slack), slack) - middle * scale + 0.0
+            shifts = _shifts(np.clip(start, -slack, slack), slack) - middle * scale + room.middle_m
             if each_way:  # first try the path scaled with the floor
-                shifts = np.vstack([np.zeros(2), shifts])
+                shifts = np.vstack([room.middle_m, shifts])
             dense = _dense(path, scale, max(free.step_m, 0.02))
             for shift in shifts[free.holds(dense, shifts)]:
                 numbers = (float(scale[0]), float(scale[1]), float(shift[0]), float(shift[1]))
@@ -190,8 +249,8 @@ def _placed(path: Path, room: Room, whole: Array, *, each_way: bool) -> Path:
                 if room.refusal(found) is None:
                     return found
     raise InputError(
-        f"path {path.name} does not fit between the obstacles on the floor of {room.floor_m[0]:g} x "
-        f"{room.floor_m[1]:g} m, not even at a quarter of its size; move the furniture, or give your "
+        f"path {path.name} does not fit between the obstacles on the floor of {2 * room.half_m[0]:g} x "
+        f"{2 * room.half_m[1]:g} m, not even at a quarter of its size; move the furniture, or give your "
         "own points in a CSV file"
     )
 
@@ -211,34 +270,125 @@ def _dense(path: Path, scale: Array, step_m: float) -> Array:
     return scaled.at(np.linspace(0.0, scaled.length * (1 - 1e-12), count))
 
 
+def _covering(room: Room) -> Path:
+    """A path over the largest connected part of the free floor of a room; warns of parts it cannot enter.
+
+    Raises:
+        InputError: The robot can stand nowhere.
+    """
+    for clear in (CLEAR_M, 0.0):
+        free = _Free(room, clear, PLAN_STEP_M)
+        found = cover(free.inside(room, clear), STRIP_M / free.step_m)
+        if found is not None and len(found.cells) > 1:
+            break
+    else:
+        raise InputError(
+            f"path {COVERAGE} does not fit: a robot of radius {room.footprint_radius_m:g} m can stand "
+            "nowhere on the free floor; move the furniture, or enlarge the floor"
+        )
+    for count, cell in found.closed:
+        if (area := count * free.step_m**2) > LITTLE_M2:
+            x, y = free.places(cell)
+            warnings.warn(
+                f"path {COVERAGE} cannot enter {area:.1f} m2 of the free floor about ({x:.2f}, {y:.2f}): "
+                f"{_closed_by(room, x, y)}",
+                MismatchWarning,
+                stacklevel=4,
+            )
+    path = Path(COVERAGE, free.places(found.cells), swept=round(found.share, 3))
+    if (error := room.refusal(path)) is not None:
+        raise error
+    return path
+
+
+@PATHS.register(COVERAGE)
+def coverage(*, length_m: float = 6.0, width_m: float = 3.5, footprint_radius_m: float = 0.171) -> Path:
+    """Strips over a whole floor, 0.5 m apart. `path_in` plans it for a room, through every open door.
+
+    Args:
+        length_m: Length of an empty floor along x [m].
+        width_m: Its width along y [m].
+        footprint_radius_m: Radius of the robot [m].
+    """
+    return _covering(Room((length_m, width_m), footprint_radius_m, Obstacles()))
+
+
+def _closed_by(room: Room, x: float, y: float) -> str:
+    """Why a part of the floor cannot be entered, and what to do."""
+    doors = [k for k, name in enumerate(room.obstacles.names) if name.endswith("/leaf")]
+    near = Obstacles(
+        tuple(room.obstacles.names[k] for k in doors), tuple(room.obstacles.outlines[k] for k in doors)
+    )
+    _, which = near.clearance([[x, y]])
+    if which[0] < 0:
+        return f"no way is {2 * room.footprint_radius_m:g} m wide; add a [[door]], or move what is in the way"
+    name = near.names[which[0]].removesuffix("/leaf")
+    return f"the door nearest to it is {name}; open it (open_deg = 90), or make it wider (width_m)"
+
+
+def _swept(path: Path, named: Path, room: Room) -> float:
+    """Share of the free floor around a placed path, by that around the path on the floor it is made for.
+
+    The floor around a path is that inside its convex hull, and up to half a strip outside.
+    """
+    made_for = Room(FLOOR_M, RADIUS_M, Obstacles())
+    return round(min(1.0, _around(path, room) / max(_around(named, made_for), 1e-9)), 3)
+
+
+def _around(path: Path, room: Room) -> float:
+    """Share of the places of a robot in a room that are inside a path's hull, or near it."""
+    free = _Free(room, 0.0, math.sqrt(4 * math.prod(room.half_m) / FEW_CELLS))
+    places = free.places(np.argwhere(free.inside(room, 0.0)))
+    hull = path.p_xy[:: max(1, len(path.p_xy) // 100)]
+    away, _ = Obstacles((path.name,), (hull,)).clearance(places, reach_m=STRIP_M)
+    return float(np.mean(away <= STRIP_M / 2)) if len(places) else 1.0
+
+
 class _Free:
     """Raster of the places where the robot's centre can be."""
 
-    def __init__(self, room: Room, clear_m: float) -> None:
+    def __init__(self, room: Room, clear_m: float, step_m: float = STEP_M) -> None:
         """Mark the places where the robot is at least `clear_m` away from obstacles on the floor."""
-        half = np.asarray(room.floor_m) / 2
-        self.step_m = max(STEP_M, math.sqrt(4 * half[0] * half[1] / MOST_CELLS))
-        self._low = -half
-        axes = [np.arange(-h, h + self.step_m, self.step_m) for h in half]
+        half, middle = room.half_m, room.middle_m
+        self.step_m = max(step_m, math.sqrt(4 * half[0] * half[1] / MOST_CELLS))
+        self._low = middle - half
+        axes = [m + np.arange(-h, h + self.step_m, self.step_m) for m, h in zip(middle, half, strict=True)]
         at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         inner = half - 1e-6  # an outline that only touches the floor's edge is outside
-        pairs = zip(room.obstacles.names, room.obstacles.outlines, strict=True)
+        pairs = zip(room.standing.names, room.standing.outlines, strict=True)
         inside = [
-            pair for pair in pairs if np.all(pair[1].max(0) > -inner) and np.all(pair[1].min(0) < inner)
+            pair
+            for pair in pairs
+            if room.corners or (np.all(pair[1].max(0) > -inner) and np.all(pair[1].min(0) < inner))
         ]
         standing = Obstacles(tuple(name for name, _ in inside), tuple(outline for _, outline in inside))
         # A point is at most this far from the nearest node of the raster.
         needed = room.footprint_radius_m + clear_m + self.step_m / math.sqrt(2)
         distance, _ = standing.clearance(at.reshape(-1, 2), reach_m=needed)
-        self._free = (distance >= needed).reshape(at.shape[:2])
+        self.free = (distance >= needed).reshape(at.shape[:2])
+        if room.corners:
+            self.free &= on_polygon(at.reshape(-1, 2), room.corners).reshape(at.shape[:2])
+
+    def inside(self, room: Room, clear_m: float) -> NDArray[np.bool_]:
+        """The free places at which the robot is on the floor, and `clear_m` from its border."""
+        nodes = [
+            self._low[k] + self.step_m * np.arange(n) - room.middle_m[k]
+            for k, n in enumerate(self.free.shape)
+        ]
+        near = [np.abs(nodes[k]) <= room.reach_m[k] - clear_m for k in (0, 1)]
+        return np.asarray(self.free & near[0][:, None] & near[1])
+
+    def places(self, cells: ArrayLike) -> Array:
+        """World x and y of cells (N, 2) [m]."""
+        return self._low + self.step_m * np.asarray(cells)
 
     def holds(self, points: Array, shifts: ArrayLike) -> NDArray[np.bool_]:
         """Whether all points (N, 2) are free after each of the shifts (M, 2), shape (M,)."""
-        if self._free.all():
+        if self.free.all():
             return np.ones(len(np.asarray(shifts)), bool)
-        most: Array = np.array(self._free.shape) - 1.0
+        most: Array = np.array(self.free.shape) - 1.0
         held = []
         for shift in np.asarray(shifts):
             cell = np.clip(np.rint((points + shift - self._low) / self.step_m), 0, most).astype(int)
-            held.append(bool(self._free[cell[:, 0], cell[:, 1]].all()))
+            held.append(bool(self.free[cell[:, 0], cell[:, 1]].all()))
         return np.array(held)

@@ -19,6 +19,7 @@ def run_summary(
     lines = (
         ("from", _origin(metadata)),
         ("path", _driven(columns)),
+        ("floor", swept(metadata)),
         ("field", _field_range(columns)),
         ("flags" if flags else "columns", flags or listed(columns)),
     )
@@ -58,6 +59,19 @@ def _driven(columns: Columns) -> str:
             (x0, y0), (x1, y1) = p[:, :2].min(axis=0), p[:, :2].max(axis=0)
             return f"{length:.4g} m in {rectangle(x0, x1, y0, y1)} ({name})"
     return ""
+
+
+def swept(metadata: Mapping[str, Any]) -> str:
+    """How much of the free floor a path sweeps that was planned for or scaled to a room."""
+    share = metadata.get("path_swept")
+    if not isinstance(share, float):
+        return ""
+    if "path_placing" not in metadata:
+        return f"{share:.1%} of the floor that the robot can reach is within 0.25 m of the path"
+    return (
+        f"{1 - share:.0%} of the free floor is outside of the path, which was scaled to fit; "
+        'path "coverage" drives all of it'
+    )
 
 
 def _field_range(columns: Columns) -> str:

@@ -80,7 +80,7 @@ class Wall(Spec):
 
 
 @dataclass(frozen=True)
-class _Opening(Spec):
+class _Opening:
     """An opening in a wall."""
 
     wall: str | int
@@ -95,10 +95,6 @@ class _Opening(Spec):
     width_m: float = 0.9
     height_m: float = 2.0
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._above_zero("width_m", "height_m")
-
     @property
     def span_m(self) -> Vec2:
         """Begin and end of the opening along the wall [m]."""
@@ -106,7 +102,7 @@ class _Opening(Spec):
 
 
 @dataclass(frozen=True)
-class Door(_Opening):
+class Door(_Opening, Spec):
     """A door in a wall: an opening from the floor up, with a leaf that turns."""
 
     _: KW_ONLY
@@ -141,7 +137,7 @@ class Door(_Opening):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._above_zero("thickness_m")
+        self._above_zero("width_m", "height_m", "thickness_m")
         self._not_negative("susceptibility")
         self._within("open_deg", -180, 180)
         self._named("hinge", ("start", "end"))
@@ -169,7 +165,7 @@ class Door(_Opening):
 
 
 @dataclass(frozen=True)
-class Window(_Opening):
+class Window(_Opening, Spec):
     """A window in a wall: an opening without glass above a sill. One with a sill of 0 is a passage."""
 
     _: KW_ONLY
@@ -188,6 +184,7 @@ class Window(_Opening):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._above_zero("width_m", "height_m")
         self._not_negative("sill_m")
 
 

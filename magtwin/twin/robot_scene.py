@@ -105,7 +105,8 @@ def _with_path(scene: Scene) -> Scene:
     robot, obstacles = scene.robot, obstacles_in(scene.lab, scene.furniture)
     if scene.path:
         return scene
-    room = Room(scene.lab.floor_m, robot.footprint_radius_m, obstacles)
+    corners = scene.lab.corners if scene.lab.floor else ()
+    room = Room(scene.lab.floor_m, robot.footprint_radius_m, obstacles, corners)
     for path in PATHS:
         with suppress(InputError):
             way = path_in(room, path)

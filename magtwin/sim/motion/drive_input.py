@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.path import Path, resolve_path
-from magtwin.path.room import Room, fit_path, path_in
+from magtwin.path.room import SWEPT, Room, fit_path, path_in
 from magtwin.run.run import Run
 from magtwin.sim.motion.commands import Commands
 
@@ -68,6 +68,8 @@ def path_metadata(path: DriveInput) -> dict[str, str | int | float | bool]:
     metadata: dict[str, str | int | float | bool] = {f"{kind}_file": file} if file else {}
     if isinstance(path, Path) and path.placing:
         metadata["path_placing"] = " ".join(map(repr, path.placing))
+    if isinstance(path, Path) and path.swept is not None and (path.swept < SWEPT or not path.placing):
+        metadata["path_swept"] = path.swept
     checksum = hashlib.sha256()
     for array in arrays:
         checksum.update(np.ascontiguousarray(array).tobytes())

@@ -96,7 +96,7 @@ def _define_slab(stage: Usd.Stage, spec: LabSpec, edge: float) -> None:
     outline = CrossSection([np.array(spec.corners)], FillRule.Positive).offset(edge, JoinType.Miter, 2.0)
     made = Manifold.extrude(outline, FLOOR_THICKNESS_M).translate((0, 0, -FLOOR_THICKNESS_M)).to_mesh()
     mesh = UsdGeom.Mesh.Define(stage, LAB.AppendChild("Floor"))
-    define_triangles(mesh, np.asarray(made.vert_properties)[:, :3], made.tri_verts)
+    define_triangles(mesh, np.asarray(made.vert_properties)[:, :3], made.tri_verts, shaded=True)
     wear(mesh, FLOOR)
 
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from pxr import Kind, Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.errors import InputError
 from magtwin.frames import IDENTITY_XYZW, quat_from_yaw, yaw_from_quat
@@ -41,7 +41,6 @@ def define_walls(stage: Usd.Stage, lab: LabSpec) -> None:
         own = wall in structure.walls
         path = WALLS.AppendChild(wall.name if own or lab.floor else wall.name.capitalize())
         prim = UsdGeom.Xform.Define(stage, path).GetPrim()
-        Usd.ModelAPI(prim).SetKind(Kind.Tokens.component)
         write_pose(prim, (*wall.start, 0.0), wall.q_world_xyzw)
         if own:
             write_spec(apply_api(prim, "wall"), "wall", wall, skip=("name",))
