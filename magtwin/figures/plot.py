@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from magtwin.errors import InputError, MismatchWarning
@@ -19,6 +20,9 @@ from magtwin.spec.scene import Scene
 from magtwin.twin import Twin, open_twin, scene_of
 from magtwin.twin.opening import open_unwritten
 from magtwin.twin.twin import Place
+
+LEVEL_NT = 20.0
+"""A map that varies less is drawn as a bare floor [nT]."""
 
 MOST_LABELS = 40
 """Pieces of furniture that are labelled with their names."""
@@ -77,7 +81,12 @@ def draw_scene(twin: Twin) -> Figure:
     tall = min(max((y1 - y0) / (x1 - x0), 0.3), 1.5)
     figure = new_figure(8.0, 6.6 * tall + 1.6)
     ax = figure.subplots()
-    draw_mean(ax, twin.field)
+    known = twin.field.values_nt[twin.field.valid]
+    level = known.size == 0 or np.ptp(known) < LEVEL_NT
+    if level:  # its noise would fill the scale
+        ax.set(xlim=(x0 - 0.2, x1 + 0.2), ylim=(y0 - 0.2, y1 + 0.2))
+    else:
+        draw_mean(ax, twin.field)
     ax.set_aspect("equal")
     plan.draw(ax)
     for piece in scene.furniture[:MOST_LABELS]:
@@ -104,7 +113,8 @@ def draw_scene(twin: Twin) -> Figure:
             textcoords="offset points",
             zorder=7,
         )
-    label(ax, "x [m]", "y [m]", title=f"{scene.name}, from above")
+    same = f"; the map is {known.mean():,.0f} nT everywhere" if level and known.size else ""
+    label(ax, "x [m]", "y [m]", title=f"{scene.name}, from above{same}")
     handles = plan.keys()
     if handles:
         figure.legend(handles.values(), handles.keys(), loc="outside upper right", ncols=3, fontsize=8)
