@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -91,7 +92,7 @@ def draw_scene(twin: Twin) -> Figure:
     plan.draw(ax)
     for piece in scene.furniture[:MOST_LABELS]:
         box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.7}
-        middle = {"ha": "center", "va": "center", "fontsize": 8, "zorder": 6}
+        middle: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8, "zorder": 6}
         ax.text(*piece.p_world[:2], piece.name, bbox=box, **middle)
     for source in scene.sources[:MOST_LABELS]:
         ax.plot(*source.p_world[:2], marker="x", ms=6, mec=BOUND, ls="", zorder=5)
