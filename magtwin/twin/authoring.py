@@ -143,7 +143,10 @@ def _file_of(path: str | FilePath) -> FilePath:
     return file if file.exists() and str(path) not in known else find("scene", str(path), known)
 
 
-class Authored(type(FilePath())):  # type: ignore[misc]
+_Path = FilePath if TYPE_CHECKING else type(FilePath())  # a Path of Python 3.11 has no subclasses of its own
+
+
+class Authored(_Path):
     """The root layer of a scene that was written: a path, which also shows the scene."""
 
     @property
@@ -175,7 +178,7 @@ def author_scene(
     force: bool = False,
     report: Report = TOLD,
     progress: Progress = lambda done, total, what: None,
-) -> FilePath:
+) -> Authored:
     """Write a scene as a folder of USD layers that needs no file outside it.
 
     Args:

@@ -23,6 +23,7 @@ SIDES += [(0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
 
 def small(name="den") -> mt.Room:
     """A room of everything that a room can have."""
+    sensor = {"rate_hz": 20, "p_link_sensor": (0.02, 0, 0.01)}
     return (
         mt.Room(5, 4, name=name, seed=4, wall_height_m=0.25)
         .wall((0.5, -2), (0.5, 2), material="reinforced_concrete")
@@ -38,10 +39,16 @@ def small(name="den") -> mt.Room:
         .robot(
             at=(-1.5, -1),
             yaw=0.5,
-            magnetometer={"rate_hz": 20, "p_link_sensor": (0.02, 0, 0.01)},
+            magnetometer=sensor,
             path="sine",
         )
-        .robot(name="second", at=(1.5, 0), battery={"capacity_wh": 30}, footprint_radius_m=0.2)
+        .robot(
+            name="second",
+            at=(1.5, 0),
+            magnetometer=sensor,
+            battery={"capacity_wh": 30},
+            footprint_radius_m=0.2,
+        )
     )
 
 
@@ -51,16 +58,19 @@ def room() -> mt.Room:
 
 
 def same(one: mt.Scene, other: mt.Scene) -> bool:
-    """Whether two scenes are equal but for where their files lie."""
+    """Whether two scenes and their maps are equal but for where their files lie, and what they say of it."""
 
     def bare(scene: mt.Scene) -> mt.Scene:
         robots = [
             dataclasses.replace(placed, robot=dataclasses.replace(placed.robot, asset=Path()))
             for placed in scene.robots
         ]
-        return dataclasses.replace(scene, map_layer=Path(), robot=robots[0].robot, others=tuple(robots[1:]))
+        return dataclasses.replace(
+            scene, map_layer=Path(), map_sha256="", robot=robots[0].robot, others=tuple(robots[1:])
+        )
 
-    return bare(one) == bare(other)
+    maps = [mt.load_map(scene.map_layer).values_nt.tobytes() for scene in (one, other)]
+    return bare(one) == bare(other) and maps[0] == maps[1]
 
 
 def test_toml_python_and_usd_lead_to_each_other_without_loss(room, tmp_path):
