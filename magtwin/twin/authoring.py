@@ -143,7 +143,10 @@ def _file_of(path: str | FilePath) -> FilePath:
     return file if file.exists() and str(path) not in known else find("scene", str(path), known)
 
 
-_Path = FilePath if TYPE_CHECKING else type(FilePath())  # a Path of Python 3.11 has no subclasses of its own
+if TYPE_CHECKING:
+    _Path = FilePath
+else:
+    _Path = type(FilePath())  # before Python 3.12, only this has subclasses
 
 
 class Authored(_Path):
