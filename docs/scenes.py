@@ -29,7 +29,8 @@ magtwin scene room.toml --out room
 magtwin run room/room.usda
 ```
 
-In Python, `magtwin.author_scene("room.toml", "room")` makes the same folder. A small scene:
+In Python, `magtwin.author_scene("room.toml", "room")` makes the same folder, and `magtwin.Room` makes a room
+call by call, with these keys: [python.md](python.md). A small scene:
 
 ```toml
 name = "small"

@@ -177,6 +177,8 @@ class TrainConfig:
         for name, value in options.items():
             if name not in names:
                 raise InputError(f"{name} is no option of a training; {hint(name, names)}", parameter=name)
+            if name == "features" and isinstance(value, list | tuple):
+                value = ",".join(map(str, value))
             options[name] = value_of(TrainConfig, name, value)
         keep = {field.name: getattr(self, field.name) for field in fields(self)}
         if options.get("model", self.model) != self.model:
