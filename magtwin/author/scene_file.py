@@ -209,8 +209,7 @@ def scene_from_toml(
         )
         start = robot_table.start or (ZERO3 if of_robot else given.start)
         if robot_table.start is None and of_robot and (drives or cut) and drives != "random":
-            corners = lab.corners if lab.floor else ()
-            room = Room(lab.floor_m, made.footprint_radius_m, standing, corners)
+            room = Room(lab.floor_m, made.footprint_radius_m, standing, lab.border)
             way = path_in(room, drives or "figure8")  # not in each other
             start = float(way.p_xy[0, 0]), float(way.p_xy[0, 1]), float(way.heading(0.0))
         robots.append(PlacedRobot(robot=made, start=start, path=drives))

@@ -62,10 +62,7 @@ class Room:
     def refusal(self, path: Path) -> InputError | None:
         """The error if the robot cannot drive the path here; None if it can."""
         try:
-            if self.corners:
-                self._check_inside(path)
-            else:
-                check_on_floor(path, self.floor_m, self.footprint_radius_m)
+            check_on_floor(path, self.floor_m, self.footprint_radius_m, self.corners)
             check_clear(path, self.standing, self.footprint_radius_m)
         except InputError as error:
             return error
@@ -85,16 +82,6 @@ class Room:
     def middle_m(self) -> Array:
         """Its middle in world [m], shape (2,)."""
         return np.asarray(self.corners).min(axis=0) + self.half_m if self.corners else np.zeros(2)
-
-    def _check_inside(self, path: Path) -> None:
-        outside = np.flatnonzero(~on_polygon(path.p_xy, self.corners))
-        if len(outside):
-            i = int(outside[0])
-            x, y = path.p_xy[i]
-            raise InputError(
-                f"path {path.name} leaves the floor at point {i + 1} of {len(path.p_xy)}, ({x:.3f}, {y:.3f}) "
-                f"m, outside its {len(self.corners)} corners; give `fit=True`, or move its points"
-            )
 
 
 def _fence(a: Vec2, b: Vec2) -> Array:
@@ -155,17 +142,30 @@ def fit_path(path: Path, room: Room) -> Path:
     return _placed(path, room, np.array([whole, whole]), each_way=False)
 
 
-def check_on_floor(path: Path, floor_m: tuple[float, float], footprint_radius_m: float) -> None:
-    """Check that a round robot on the path stays on a floor centred on the world's origin.
+def check_on_floor(
+    path: Path, floor_m: tuple[float, float], footprint_radius_m: float, corners: tuple[Vec2, ...] = ()
+) -> None:
+    """Check that a round robot on the path stays on a floor centred on the world's origin, or with corners.
 
     Args:
         path: Path of its centre.
         floor_m: Extent of the floor in x and y [m].
         footprint_radius_m: Radius of the robot [m].
+        corners: Corners of a floor that is no rectangle [m]; only the path itself must then be inside of it.
 
     Raises:
         InputError: It does not; the text has the first such point and what would fit.
     """
+    outside = np.flatnonzero(~on_polygon(path.p_xy, corners)) if corners else np.empty(0)
+    if len(outside):
+        i = int(outside[0])
+        x, y = path.p_xy[i]
+        raise InputError(
+            f"path {path.name} leaves the floor at point {i + 1} of {len(path.p_xy)}, ({x:.3f}, {y:.3f}) m, "
+            f"outside its {len(corners)} corners; give `fit=True`, or move its points"
+        )
+    if corners:
+        return
     beyond = np.max(np.abs(path.p_xy) + footprint_radius_m - np.array(floor_m) / 2, axis=1)
     outside = np.flatnonzero(beyond > 1e-9)
     if len(outside):
@@ -365,17 +365,16 @@ class _Free:
         # A point is at most this far from the nearest node of the raster.
         needed = room.footprint_radius_m + clear_m + self.step_m / math.sqrt(2)
         distance, _ = standing.clearance(at.reshape(-1, 2), reach_m=needed)
-        self.free = (distance >= needed).reshape(at.shape[:2])
+        self.free: NDArray[np.bool_] = (distance >= needed).reshape(at.shape[:2])
         if room.corners:
             self.free &= on_polygon(at.reshape(-1, 2), room.corners).reshape(at.shape[:2])
 
     def inside(self, room: Room, clear_m: float) -> NDArray[np.bool_]:
         """The free places at which the robot is on the floor, and `clear_m` from its border."""
-        nodes = [
-            self._low[k] + self.step_m * np.arange(n) - room.middle_m[k]
-            for k, n in enumerate(self.free.shape)
-        ]
-        near = [np.abs(nodes[k]) <= room.reach_m[k] - clear_m for k in (0, 1)]
+        near = list[NDArray[np.bool_]]()
+        for k, count in enumerate(self.free.shape):
+            nodes = self._low[k] - room.middle_m[k] + self.step_m * np.arange(count)
+            near.append(np.abs(nodes) <= room.reach_m[k] - clear_m)
         return np.asarray(self.free & near[0][:, None] & near[1])
 
     def places(self, cells: ArrayLike) -> Array:

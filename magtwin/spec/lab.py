@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,6 +91,11 @@ class LabSpec(Spec):
         return (x0, y0), (x1, y0), (x1, y1), (x0, y1)
 
     @property
+    def border(self) -> tuple[Vec2, ...]:
+        """Corners of a floor that has them, counter-clockwise [m]; () for a rectangle about the origin."""
+        return self.corners if self.floor else ()
+
+    @property
     def sides(self) -> tuple[Wall, ...]:
         """Low walls along the sides of the floor, outside of it and seen counter-clockwise."""
         if not self.wall_height_m:
@@ -142,7 +148,8 @@ def on_polygon(p_xy: NDArray[np.float64], corners: Sequence[Vec2]) -> NDArray[np
     return inside | border
 
 
-def check_corners(corners: Sequence[Vec2]) -> None:
+@lru_cache(maxsize=64)
+def check_corners(corners: tuple[Vec2, ...]) -> None:
     """Refuse a floor whose corners are not those of a polygon.
 
     Raises:

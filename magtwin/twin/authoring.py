@@ -230,25 +230,44 @@ def _made(scene: Any) -> Scene:
     return scene.scene  # type: ignore[no-any-return]
 
 
-def new_scene(out: str | FilePath, *, force: bool = False) -> FilePath:
-    """Write a TOML with comments that describes a small furnished room, to start from.
+def new_scene(
+    out: str | FilePath,
+    *,
+    plan: str | FilePath | None = None,
+    scale: float | None = None,
+    report: Report = lambda text: None,
+    force: bool = False,
+) -> FilePath:
+    """Write a TOML with comments that describes a small furnished room, or the room of a floor plan.
 
     Args:
         out: TOML to write. The scene is named after it.
+        plan: Floor plan (.svg, .dxf, .geojson), or occupancy map of ROS (.pgm, .png or its .yaml).
+        scale: Metres per unit of the plan, or per cell of the map. Default: what the file states.
+        report: Called with a line about each thing that was deduced or left out.
         force: Whether to replace a file that exists.
 
     Returns:
         The file.
 
     Raises:
-        InputError: The file exists, or its name cannot name a scene.
+        InputError: The file exists, or its name cannot name a scene; or the plan has no scale or no walls.
     """
     from magtwin.author.room import check_name
 
     name = FilePath(out).stem
     check_name(name)
-    text = shipped("scenes", "starter.toml").read_text(encoding="utf-8")
-    text = text.replace('name = "room"', f'name = "{name}"', 1)
+    if plan is not None:
+        from magtwin.author.plan.plan import plan_toml
+
+        text, notes = plan_toml(FilePath(plan), name, scale)
+        for note in notes:
+            report(note)
+    elif scale is not None:
+        raise InputError("scale is that of a plan; give `plan=FILE` too", parameter="scale")
+    else:
+        text = shipped("scenes", "starter.toml").read_text(encoding="utf-8")
+        text = text.replace('name = "room"', f'name = "{name}"', 1)
     with output(out, force=force) as aside:
         aside.write_text(text, encoding="utf-8")
     return FilePath(out)

@@ -105,8 +105,7 @@ def _with_path(scene: Scene) -> Scene:
     robot, obstacles = scene.robot, obstacles_in(scene.lab, scene.furniture)
     if scene.path:
         return scene
-    corners = scene.lab.corners if scene.lab.floor else ()
-    room = Room(scene.lab.floor_m, robot.footprint_radius_m, obstacles, corners)
+    room = Room(scene.lab.floor_m, robot.footprint_radius_m, obstacles, scene.lab.border)
     for path in PATHS:
         with suppress(InputError):
             way = path_in(room, path)

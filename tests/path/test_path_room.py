@@ -31,7 +31,7 @@ def test_on_the_default_floor_named_paths_are_as_they_were_to_the_bit(name):
 
 @settings(max_examples=30, deadline=None)
 @given(
-    name=st.sampled_from(sorted(PATHS)),
+    name=st.sampled_from(sorted(set(PATHS) - {"coverage"})),  # which is planned, not scaled
     x=st.floats(1.0, 30.0),
     y=st.floats(1.0, 30.0),
     radius=st.floats(0.05, 0.4),

@@ -20,6 +20,7 @@ from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import PlacedRobot, RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec, MountSpec
+from magtwin.spec.walls import Door, Wall, Window
 
 ROBOT = RobotSpec(name="robot", asset=Path("robot.usda"))
 EARTH = EarthFieldSpec(
@@ -43,6 +44,9 @@ SPECS = (
     PlatformFieldSpec(),
     ROBOT,
     LabSpec(),
+    Wall((0.0, 0.0), (1.0, 0.0)),
+    Door("wall_0", 0.5),
+    Window("wall_0", 0.5),
     EARTH,
     SourceSpec(name="beam", p_world=(0.0, 0.0, 0.0), m_world=(0.0, 0.0, 1.0)),
     SourceSpec(

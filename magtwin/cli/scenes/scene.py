@@ -13,8 +13,10 @@ from magtwin.errors import InputError
 
 
 @app.command
-def new(out: Path, *, force: Force = False) -> Done:
-    """Write a file to start from: a TOML of a small furnished room, or a localizer in Python.
+def new(out: Path, *, plan: Path | None = None, scale: float | None = None, force: Force = False) -> Done:
+    """Write a file to start from: a TOML of a room, or a localizer in Python.
+
+    The room is a small furnished one, or that of a floor plan or an occupancy map.
 
     Author a room with `magtwin scene room.toml --out room`. Test a localizer with `magtwin localize RUN --map
     lab --method localizer:MyLocalizer`.
@@ -23,6 +25,11 @@ def new(out: Path, *, force: Force = False) -> Done:
     ----------
     out
         File to write: .toml for a room, whose scene gets the file's name; .py for a localizer.
+    plan
+        Floor plan to make the room from: .svg, .dxf or .geojson, with layers or classes named after doors and
+        windows; or .pgm or .yaml, an occupancy map of ROS.
+    scale
+        Metres per unit of the plan, or per cell of the map. Default: what the file states.
     """
     check_output(out, (".toml", ".py"), "a room or a localizer", force=force)
     if out.suffix.lower() == ".py":
@@ -35,7 +42,7 @@ def new(out: Path, *, force: Force = False) -> Done:
         return Done(wrote=out, text=f"Wrote {out}\nNext:  {folder}{drive}\n       {try_it}")
     from magtwin.twin import new_scene
 
-    new_scene(out, force=force)
+    new_scene(out, plan=plan, scale=scale, report=announce, force=force)
     room = out.with_suffix("")
     stage = shlex.quote(str(room / f"{out.stem}.usda"))
     author = f"magtwin scene {shlex.quote(str(out))} --out {shlex.quote(str(room))}"

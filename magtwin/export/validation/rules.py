@@ -17,6 +17,7 @@ from magtwin.export.contents import named_files, weights_metadata
 from magtwin.export.validation.findings import Severity
 from magtwin.export.validation.rule import Subject, Wrong, rule, wrong_of
 from magtwin.files.file import sha256
+from magtwin.spec.lab import on_polygon
 from magtwin.usd.lab.looks import VISUALS
 from magtwin.usd.lab.obstacles import read_obstacles
 from magtwin.usd.lab.room import read_lab
@@ -189,11 +190,13 @@ def robot_inside(subject: Subject) -> Iterator[Wrong]:
     """Every robot stands on the floor, with its footprint inside it."""
     for stage in subject.labs:
         world, cache = stage.GetPseudoRoot(), UsdGeom.XformCache()
-        half = np.array(read_lab(prims_with(world, "lab")[0]).floor_m) / 2
+        lab = read_lab(prims_with(world, "lab")[0])
+        half = np.array(lab.floor_m) / 2
         for prim in prims_with(world, "robot"):
             x, y, _ = cache.GetLocalToWorldTransform(prim).ExtractTranslation()
             radius = read_footprint(prim)
-            if np.any(np.abs([x, y]) + radius > half + SAME_M):
+            off = lab.floor and not on_polygon(np.array([[x, y]]), lab.floor)[0]
+            if off or np.any(np.abs([x, y]) + radius > half + SAME_M):
                 text = f"stands at ({x:g}, {y:g}) m and needs {radius:g} m about it: it is off the floor"
                 yield Wrong(text, str(prim.GetPath()))
 

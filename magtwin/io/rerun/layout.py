@@ -312,19 +312,21 @@ def lab_eye(lab: LabSpec) -> tuple[Vec3, Vec3]:
 
     The eye is above the near edge of the floor, inside the capture frame, so that no rail crosses the floor.
     """
-    x, y = lab.floor_m
+    x0, x1, y0, y1 = lab.extent_m
+    x, y, at_x, at_y = x1 - x0, y1 - y0, (x0 + x1) / 2, (y0 + y1) / 2
     height = max(0.9 * max(x, 1.7 * y), 1.5 * lab.post_height_m)
-    return (0, -0.45 * y, height), (0, -0.09 * y, 0)
+    return (at_x, at_y - 0.45 * y, height), (at_x, at_y - 0.09 * y, 0)
 
 
 def _floor_view(lab: LabSpec, names: Sequence[str]) -> rrb.Spatial2DView:
     """The map and the paths from above, x to the right and y up, in metres."""
-    x, y = (0.5 * side + lab.wall_thickness_m for side in lab.floor_m)
+    x0, x1, y0, y1 = lab.extent_m
+    more = lab.wall_thickness_m
     return rrb.Spatial2DView(
         origin="floor",
         name="Map from above [m]",
         background=(24, 26, 31),
-        visual_bounds=rrb.VisualBounds2D(x_range=(-x, x), y_range=(-y, y)),
+        visual_bounds=rrb.VisualBounds2D(x_range=(x0 - more, x1 + more), y_range=(y0 - more, y1 + more)),
         overrides={entity_of("floor/paths/driven", name): _visible(all_time=True) for name in names},
     )
 

@@ -1,0 +1,1 @@
+"""Floor plans: drawings and occupancy grids, made the TOML of a scene."""
