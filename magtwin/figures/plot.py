@@ -34,14 +34,15 @@ def plot(
     *,
     anomaly_map: AnomalyMap | None = None,
     scene: Twin | Place | None = None,
-    quantity: str = "field",
+    quantity: str = "overview",
     headings: Sequence[float] | None = None,
 ) -> Figure:
     """Draw a run, a map or a scene.
 
-    A run: the path over map, walls and furniture, coloured by the field, and field, disturbance, speed and
-    battery against time, of those columns that it has. A map: filled contours, one panel per heading. A
-    scene: the room from above with its robots, over the mean of its map.
+    A run: the path over map, walls and furniture, coloured by the reading less the map, and against time what
+    the map lacks, the error of the prediction, the field, speed and battery, of those columns that it has. A
+    map: filled contours of its mean, heading effect, standard deviation and gradient. A scene: the room from
+    above with its robots, over the mean of its map.
 
     Args:
         what: A `Run`, an `AnomalyMap`, a twin, or a scene as for `open_twin`.
@@ -49,7 +50,7 @@ def plot(
             of the scene.
         scene: For a run: its scene. Default: that of its metadata, if it is there and has not changed;
             otherwise the floor is bare.
-        quantity: For a map: "field", "gradient", "variance", "mask" or "headings"; see
+        quantity: For a map: "overview", "field", "gradient", "variance", "mask" or "headings"; see
             `magtwin.figures.maps.draw_map`.
         headings: For a map: headings to show [rad]. None shows the map's own, or about four of more than
             eight.
