@@ -142,6 +142,7 @@ pictures: $(VENV)/.installed build/blender/.installed  ## Draw the pictures of R
 	$(BIN)/magtwin report build/pictures/run.parquet --out build/pictures/run.html --force
 	$(BIN)/python docs/page_film.py build/pictures/run.html docs/page.gif docs/page.png
 	$(BIN)/magtwin plot build/pictures/run.parquet --camera 0.4,-1.6,6.1:0.4,-0.2,0 --size 560x350 --pace 10 --fps 8 --out docs/run.gif --force
+	$(BIN)/python docs/python.py
 	MAGTWIN_BLENDER=$(CURDIR)/build/blender/bin/python $(BIN)/python docs/looks.py
 
 clean:  ## Remove the environment and what was built

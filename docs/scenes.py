@@ -29,7 +29,8 @@ magtwin scene room.toml --out room
 magtwin run room/room.usda
 ```
 
-In Python, `magtwin.author_scene("room.toml", "room")` makes the same folder. A small scene:
+In Python, `magtwin.author_scene("room.toml", "room")` makes the same folder, and `magtwin.Room` makes a room
+call by call, with these keys: [python.md](python.md). A small scene:
 
 ```toml
 name = "small"
@@ -93,8 +94,8 @@ A piece of furniture consists of parts. Its steel parts are magnetised along the
 
 ROBOT = """
 The tables below, `[robot.drive]` and so on, are for a robot from a URDF; see [urdf.md](urdf.md). An asset
-already has these values. For several robots, write one `[[robot]]` with a `name` for each, and
-`[robot.drive]` below it.
+already has these values: a key replaces the asset's, and its sensors stay on their links. For several
+robots, write one `[[robot]]` with a `name` for each, and `[robot.drive]` below it.
 """
 
 PATHS = """

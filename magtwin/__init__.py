@@ -16,6 +16,7 @@ from magtwin.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from magtwin.author.from_urdf import from_urdf as from_urdf
+    from magtwin.author.rooms import Room as Room
     from magtwin.bench.results import read_results as read_results
     from magtwin.bench.runner import benchmark as benchmark
     from magtwin.errors import InputError as InputError
@@ -36,8 +37,25 @@ if TYPE_CHECKING:
     from magtwin.run.run import COLUMNS as COLUMNS
     from magtwin.run.run import Run as Run
     from magtwin.sim.plant_families import draw_plant as draw_plant
+    from magtwin.spec.drive import DriveSpec as DriveSpec
+    from magtwin.spec.furniture import FurnitureSpec as FurnitureSpec
+    from magtwin.spec.lab import LabSpec as LabSpec
+    from magtwin.spec.lab import SurveySpec as SurveySpec
+    from magtwin.spec.magnetics import EarthFieldSpec as EarthFieldSpec
+    from magtwin.spec.magnetics import PlatformFieldSpec as PlatformFieldSpec
+    from magtwin.spec.magnetics import SourceSpec as SourceSpec
     from magtwin.spec.plant import PlantSpec as PlantSpec
+    from magtwin.spec.robot import PlacedRobot as PlacedRobot
+    from magtwin.spec.robot import RobotSpec as RobotSpec
     from magtwin.spec.scene import Scene as Scene
+    from magtwin.spec.sensors import BatterySpec as BatterySpec
+    from magtwin.spec.sensors import ImuSpec as ImuSpec
+    from magtwin.spec.sensors import LidarSpec as LidarSpec
+    from magtwin.spec.sensors import MagnetometerSpec as MagnetometerSpec
+    from magtwin.spec.sensors import MocapSpec as MocapSpec
+    from magtwin.spec.walls import Door as Door
+    from magtwin.spec.walls import Wall as Wall
+    from magtwin.spec.walls import Window as Window
     from magtwin.tasks.learning import build_dataset as build_dataset
     from magtwin.tasks.learning import calibrate as calibrate
     from magtwin.tasks.learning import error_budget as error_budget
@@ -52,12 +70,34 @@ if TYPE_CHECKING:
     from magtwin.twin import simulate as simulate
     from magtwin.twin import simulate_robots as simulate_robots
     from magtwin.twin import sweep as sweep
+    from magtwin.twin.maps import survey as survey
     from magtwin.usd.maps.layer import load_map as load_map
     from magtwin.usd.maps.layer import save_map as save_map
+    from magtwin.usd.scene import read_scene as read_scene
 
     load_run, save_run, reproduce = read_run, write_run, repeat_of
 
 _NAMES = {
+    "Room": "author.rooms",
+    "BatterySpec": "spec.sensors",
+    "DriveSpec": "spec.drive",
+    "EarthFieldSpec": "spec.magnetics",
+    "FurnitureSpec": "spec.furniture",
+    "ImuSpec": "spec.sensors",
+    "LabSpec": "spec.lab",
+    "LidarSpec": "spec.sensors",
+    "MagnetometerSpec": "spec.sensors",
+    "MocapSpec": "spec.sensors",
+    "PlacedRobot": "spec.robot",
+    "PlatformFieldSpec": "spec.magnetics",
+    "RobotSpec": "spec.robot",
+    "SourceSpec": "spec.magnetics",
+    "SurveySpec": "spec.lab",
+    "Wall": "spec.walls",
+    "Door": "spec.walls",
+    "Window": "spec.walls",
+    "read_scene": "usd.scene",
+    "survey": "twin.maps",
     "AnomalyMap": "field.maps.map",
     "COLUMNS": "run.run",
     "InputError": "errors",

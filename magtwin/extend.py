@@ -8,6 +8,7 @@
 | `@engine("name")` | `magtwin.sim.motion.engine.Engine` | `simulate(..., engine="name")` |
 | `@path("name")` | a function that returns points or a `Path` | `simulate(twin, "name")` |
 | `@map_method("name")` | `magtwin.field.fit.methods.MapMethod` | `fit_map(survey, "name")` |
+| `@network("name")` | a `torch.nn.Module` of your own | `load_predictor`, `open_twin(..., network="file")` |
 | `@predictor("name")` | `magtwin.learn.models.predictor.PredictorKind` | `train(dataset, model="name")` |
 | `@log_format(".suffix")` | `magtwin.io.formats.Format` | `run.save("run.suffix")`, `load_run` |
 | `@localizer("name")` | `magtwin.localization.problem.Localizer` | `localize(run, map, method="name")` |
@@ -15,8 +16,8 @@
 
 An installed package can announce them as entry points instead, in the groups `magtwin.sensors`,
 `magtwin.interference`, `magtwin.controllers`, `magtwin.engines`, `magtwin.paths`, `magtwin.map_methods`,
-`magtwin.predictors`, `magtwin.localizers`, `magtwin.formats` and `magtwin.rules`; then the command line knows
-those that it has an option for:
+`magtwin.predictors`, `magtwin.networks`, `magtwin.localizers`, `magtwin.formats` and `magtwin.rules`; then
+the command line knows those that it has an option for:
 
     [project.entry-points."magtwin.map_methods"]
     kriging = "my_package.kriging:fit_kriging"
@@ -39,6 +40,7 @@ _NAMES = {
     "localizer": "localization.localizers:localizer",
     "log_format": "io.formats:FORMATS.register",
     "map_method": "field.fit.methods:map_method",
+    "network": "learn.models.predictor:NETWORKS.register",
     "path": "path:path",
     "predictor": "learn.models.predictor:PREDICTORS.register",
     "rule": "export.validation.rule:rule",

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from notebook import page
 from places import ROOT
 
 JOBS = sorted((ROOT / "examples").glob("*.py"))
@@ -42,3 +43,12 @@ def test_the_tutorial_shows_the_class_of_the_localizer_example():
     of_magtwin = re.findall(r"^from magtwin\.localization\..*\n", example, re.MULTILINE)
     (written,) = re.findall(r"^class .*?(?=\n\n\n)", example, re.MULTILINE | re.DOTALL)
     assert shown == "import numpy as np\n\n" + "".join(of_magtwin) + "\n\n" + written + "\n"
+
+
+def test_the_notebook_runs_and_shows_rooms_maps_and_runs_within_3_mb(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shown = page(ROOT / "examples" / "notebook.ipynb")
+    assert len(shown) < 3_000_000
+    assert shown.count("data:image/png;base64,") == 5
+    assert "MismatchWarning: moved.usda: has changed since its map" in shown
+    assert "nT rms" in shown

@@ -78,6 +78,12 @@ class FurnitureTable(Spec):
     scale: float = 1.0
     """Factor on the coordinates of a mesh file; 0.001 for a file in mm."""
 
+    vertices_m: tuple[Vec3, ...] = ()
+    """Vertices of a mesh [m], instead of a file."""
+
+    faces: tuple[tuple[int, int, int], ...] = ()
+    """Corners of the triangles of these vertices, counter-clockwise from outside."""
+
     seed: int | None = None
     """Seed of the magnetization. Default: the scene's."""
 
@@ -93,8 +99,8 @@ class FurnitureTable(Spec):
         strong = max(map(abs, self.magnetization or ()), default=0.0)
         per_metre = "be in A/m; iron saturates at 1.7e6"
         self._require("magnetization", strong <= SATURATION_A_M, per_metre, self.magnetization)
-        if self.kind == "mesh" and self.file is None:
-            raise InputError('kind "mesh" needs file = "FILE.stl"')
+        if self.kind == "mesh" and (self.file is None) != bool(self.vertices_m):
+            raise InputError('kind "mesh" needs file = "FILE.stl", or vertices_m and faces')
         if self.kind != "mesh" and (self.file is not None or self.scale != 1):
             raise InputError(f'file and scale are for kind "mesh", not for a {self.kind}')
         object.__setattr__(self, "_piece", self._made())

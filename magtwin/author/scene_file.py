@@ -32,6 +32,9 @@ from magtwin.usd.lab.earth import checked
 from magtwin.usd.layers import layer_sha256
 from magtwin.usd.robot import load_robot
 
+PARTS = ("drive", "battery", "platform", "magnetometer", "imu", "lidar", "mocap")
+"""Tables below [robot] whose keys replace those of an asset one by one; [robot.plant] replaces all."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class _RobotTable(RobotSettings):
@@ -62,7 +65,7 @@ class _RobotTable(RobotSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _EarthTable(EarthFieldSpec):
+class EarthTable(EarthFieldSpec):
     """The Earth's field, uniform over the room. By default computed from place and date with the IGRF-14, up
     to 2030.
     """
@@ -102,7 +105,7 @@ class SceneFile:
     wall: tuple[WallTable, ...] = ()
     door: tuple[DoorTable, ...] = ()
     window: tuple[Window, ...] = ()
-    earth: _EarthTable | None = None
+    earth: EarthTable | None = None
     survey: SurveySpec | None = None
     sources: _SourcesTable | None = None
     source: tuple[SourceSpec, ...] = ()
@@ -130,6 +133,7 @@ def scene_from_toml(
     robot: Path | None = None,
     name: str = "",
     scale: float = 1.0,
+    table: Mapping[str, Any] | None = None,
     inputs_of: Callable[[Path], tuple[str, ...]] = lambda weights: (),
     survey_of: Callable[[Scene, SurveySpec, int, Obstacles], Path] | None = None,
 ) -> Scene:
@@ -145,6 +149,7 @@ def scene_from_toml(
             surveyed by this robot, if the TOML has an Earth field.
         name: Name of the scene, in place of the TOML's.
         scale: Factor on the floor and on the places of furniture and sources; their sizes stay.
+        table: The tables, if they are not in a file: `path` then stands for them in messages.
         inputs_of: Function from a weights file to the names of its inputs, see
             `magtwin.twin.scene_from_toml`. By default the scene names no inputs.
         survey_of: Function that surveys a scene without a map and returns the map layer. It gets the scene,
@@ -153,7 +158,7 @@ def scene_from_toml(
     Raises:
         InputError: A key is unknown or missing, or a file is missing; the text has file and line.
     """
-    table = read_toml(path)
+    table = read_toml(path) if table is None else dict(table)
     if name:
         table["name"] = name
     if robot is not None:
@@ -186,7 +191,7 @@ def scene_from_toml(
             f'{path}: names no map; add map = "FILE.usdc" to it, or give `map_layer=FILE.usdc`, or add an '
             f"[earth] table (latitude_deg, longitude_deg, height_m, date){more}, from which it is surveyed"
         )
-    with _about(f"{path}:"):
+    with about(f"{path}:"):
         check_names(sources, pieces)
     standing = obstacles_in(lab, pieces)
     check_not_in_walls(pieces[len(pieces) - len(given.furniture) :], lab, standing, path)
@@ -210,7 +215,7 @@ def scene_from_toml(
         robots.append(PlacedRobot(robot=made, start=start, path=drives))
         with _at(path, "start", **({"section": "robot", "number": number} if of_robot else {})):
             check_start(robots[-1], lab, standing)
-    with _about(f"{path}: [earth]"):
+    with about(f"{path}: [earth]"):
         earth = checked(EarthFieldSpec(**vars(given.earth))) if given.earth else None
     scene = Scene(
         name=given.name,
@@ -225,17 +230,17 @@ def scene_from_toml(
         path=robots[0].path,
         others=tuple(robots[1:]),
     )
-    with _about(f"{path}:"):
+    with about(f"{path}:"):
         check_things(scene)
     if layer is None and survey_of is not None:
-        with _about(f"{path}: cannot be surveyed:"):
+        with about(f"{path}: cannot be surveyed:"):
             surveyed = survey_of(scene, given.survey or SurveySpec(), given.seed, standing)
         scene = replace(scene, map_layer=surveyed, map_sha256=layer_sha256(surveyed))
     return scene
 
 
 @contextmanager
-def _about(start: str) -> Iterator[None]:
+def about(start: str) -> Iterator[None]:
     """Errors inside begin with what they are about."""
     try:
         yield
@@ -301,11 +306,11 @@ def _robot(
     if named and not table.name:
         raise InputError(f'{where} needs name = "NAME", the name of its prim')
     if table.asset is not None and table.urdf is None:
-        known = {"asset", "network", "kind", "start", "path", "plant", *(["name"] if named else [])}
-        if others := sorted(set(keys) - known):
+        if others := sorted({"conversion", *(() if named else ("name",))} & set(keys)):
             raise InputError(f"{where} {others[0]} goes with urdf; an asset has it already")
         robot = load_robot(asset_named(table.asset, keys["asset"], where))
-        robot = replace(robot, plant=table.plant.spec) if "plant" in keys else robot
+        with about(where):
+            robot = _changed(robot, table, keys)
     elif table.urdf is None or table.asset is not None:
         raise InputError(f'{where} needs asset = "FILE.usda" or urdf = "FILE.urdf", and not both')
     elif workshop is None:
@@ -317,10 +322,22 @@ def _robot(
         folder = Path(workshop) / table.name if named else Path(workshop)
         folder.mkdir(parents=True, exist_ok=True)
         asset = folder / f"{table.urdf.name.split('.')[0]}.usda"
-        with _about(where):
+        with about(where):
             build_robot(table.urdf, settings, asset)
         robot = load_robot(asset, own=True)
     return replace(robot, name=table.name) if named else robot
+
+
+def _changed(robot: RobotSpec, table: RobotSettings, keys: Mapping[str, Any]) -> RobotSpec:
+    """The robot of an asset with what its table gives: of each part, the keys that are there."""
+    for name in PARTS:
+        if name in keys:
+            given = {key: getattr(getattr(table, name), key) for key in keys[name]}
+            robot = robot.with_part(name, replace(getattr(robot, name), **given))
+    robot = replace(robot, plant=table.plant.spec) if "plant" in keys else robot
+    if table.footprint_radius_m is not None:
+        robot = replace(robot, footprint_radius_m=table.footprint_radius_m)
+    return robot
 
 
 def _with_network(
@@ -355,7 +372,7 @@ def _path(path: str, folder: Path, where: str) -> str | Path:
         return path
     file = (folder / path).resolve()
     named = not Path(path).suffix and not file.exists()
-    with _about(f"{where} path:"):
+    with about(f"{where} path:"):
         resolve_path(path if named else file)
     return path if named else file
 

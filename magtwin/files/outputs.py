@@ -37,6 +37,9 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 HIDDEN = ".magtwin-"
 """In the name of every hidden folder."""
 
+WORKSHOP = "magtwin-workshop-"
+"""Begin of the name of a temporary folder with what a scene in memory needs until Python ends."""
+
 _WRITTEN = re.compile(
     r"\.(bin|bmp|csv|dae|db3|exr|gif|glb|gltf|hdr|html|jpe?g|json|mcap|md|mtl|npz|obj|parquet|pgm|ply|png|rrd)"
     r"|\.(safetensors|sdf|stl|svg|tga|tiff?|toml|tum|urdf|usd[acz]?|webp|world|xml|yaml)|"

@@ -178,6 +178,47 @@ def _from_table(cls: type[T], table: dict[str, Any], where: "_Where") -> T:
         raise where.refused(next(named, ""), str(error)) from error
 
 
+def from_values(cls: type[T], values: Mapping[str, Any], what: str) -> T:
+    """A dataclass from values that somebody gave in Python, with every name and type checked.
+
+    Lists, tuples and arrays are alike, and NumPy's numbers are numbers.
+
+    Args:
+        cls: The dataclass.
+        values: Values by field.
+        what: How the text of a refusal begins, such as "shelf".
+
+    Raises:
+        InputError: A name is unknown or missing, or a value has the wrong type or range.
+    """
+    return from_table(cls, plain(values), what)
+
+
+def value_of(cls: type, name: str, value: Any) -> Any:
+    """A value that somebody gave in Python for a field of a dataclass, checked and converted.
+
+    Raises:
+        InputError: It has the wrong type; the text begins with the name.
+    """
+    if value is None:
+        return None
+    try:
+        return _value(typing.get_type_hints(cls)[name], plain(value), _Where(Path(), ""), name)
+    except InputError as error:
+        raise InputError(str(error).removeprefix(".: "), parameter=name) from error
+
+
+def plain(value: Any) -> Any:
+    """A value as a TOML would have it: lists for tuples and arrays, texts for paths, Python's numbers."""
+    if isinstance(value, Mapping):
+        return {key: plain(entry) for key, entry in value.items() if entry is not None}
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, tuple | list):
+        return [plain(entry) for entry in value]
+    return str(Path(value).absolute()) if isinstance(value, os.PathLike) else value
+
+
 def refused_at(
     path: str | os.PathLike[str], key: str, text: str, *, section: str = "", number: int = 0
 ) -> InputError:

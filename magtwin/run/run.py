@@ -402,11 +402,13 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         }
         return frame
 
-    def plot(self, anomaly_map: Any = None) -> "Picture":
-        """Draw the path over the floor and the readings against time; see `magtwin.plot`.
+    def plot(self, anomaly_map: Any = None, *, scene: Any = None) -> "Picture":
+        """Draw the path over map, walls and furniture, and the readings against time; see `magtwin.plot`.
 
         Args:
-            anomaly_map: An `AnomalyMap` to draw below the path; None draws a bare floor.
+            anomaly_map: An `AnomalyMap` to draw below the path. Default: that of the scene.
+            scene: Twin or scene of the run. Default: that of its metadata, if it is there and has not
+                changed; otherwise the floor is bare.
 
         Returns:
             A matplotlib figure. A notebook shows it; `figure.savefig("run.png")` writes it.
@@ -414,7 +416,8 @@ class Run(Summarized, Mapping[str, NDArray[Any]]):
         Raises:
             InputError: The run has no rows, or no column that can be drawn.
         """
-        return importlib.import_module("magtwin").plot(self, anomaly_map=anomaly_map)  # loads io when called
+        plot = importlib.import_module("magtwin").plot  # loads io when called
+        return plot(self, anomaly_map=anomaly_map, scene=scene)  # type: ignore[no-any-return]
 
     def view(self, scene: "str | os.PathLike[str] | None" = None, *, height: int = 800) -> Any:
         """The run in its lab in 3D, with charts, in a notebook: the page of `magtwin report`.

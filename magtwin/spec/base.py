@@ -4,7 +4,10 @@ A spec is plain data: `usd/` reads and authors it, `sim/` runs it. Each field is
 is checked when the spec is made. Lengths are metres, angles radians, fields nT.
 """
 
+import functools
 import math
+import types
+import typing
 from dataclasses import MISSING, Field, fields, is_dataclass
 from typing import Any
 
@@ -30,15 +33,62 @@ LATER = "later"
 """Metadata of a field that a later version added: `spelled` leaves it out while it has its default."""
 
 
+ONE, ANY = 0, -1
+"""Width of a field that is one number, and of a tuple of any length."""
+
+_Kind = tuple[int, type]
+"""Width of a field of numbers, and float or int."""
+
+
+@functools.cache
+def _number_fields(cls: type) -> dict[str, _Kind]:
+    """The fields of a spec that are numbers."""
+    widths: dict[str, _Kind] = {}
+    for name, kind in typing.get_type_hints(cls).items():
+        some = [a for a in typing.get_args(kind) if a is not type(None)]
+        if isinstance(kind, types.UnionType) and len(some) == 1:
+            kind, some = some[0], list(typing.get_args(some[0]))
+        if kind in (float, int):
+            widths[name] = ONE, kind
+        elif typing.get_origin(kind) is tuple and set(some) in ({float}, {float, Ellipsis}):
+            widths[name] = ANY if Ellipsis in some else len(some), float
+    return widths
+
+
+def _are_numbers(value: Any, width: int, kind: type) -> bool:
+    """Whether a value has the form of its field; an int is no float, and has another spelling."""
+    if width == ONE:
+        return type(value) is kind
+    return type(value) is tuple and width in (ANY, len(value)) and all(type(x) is kind for x in value)
+
+
 class Spec:
-    """Base class of all specs: every number is finite."""
+    """Base class of all specs: every number is one and finite. Lists and arrays become tuples."""
 
     def __post_init__(self) -> None:
+        kinds = _number_fields(type(self))  # type: ignore[arg-type]
         for f in fields(self):  # type: ignore[arg-type]
             value = getattr(self, f.name)
+            if f.name in kinds and not _are_numbers(value, *kinds[f.name]):
+                value = self._numbers(f.name, value, *kinds[f.name])
             numbers = value if isinstance(value, tuple) else (value,)
             finite = all(abs(x) < math.inf for x in numbers if isinstance(x, int | float))
             self._require(f.name, finite, "be finite", value)
+
+    def _numbers(self, name: str, given: Any, width: int, kind: type) -> Any:
+        """The value of a field of numbers, from NumPy's, a list's or whole ones."""
+        if given is None:  # of a field that may be None; others are refused where they are used
+            return None
+        value = given.tolist() if hasattr(given, "tolist") else given
+        many = list(value) if isinstance(value, list | tuple) and width != ONE else [value]
+        fits = width in (ANY, len(many)) or (width == ONE and not isinstance(value, list | tuple))
+        fits = fits and all(isinstance(x, int | float) and not isinstance(x, bool) for x in many)
+        what = {ONE: "be a number", ANY: "be numbers"}.get(width, f"be {width} numbers")
+        self._require(name, fits and (kind is float or all(x == int(x) for x in many)), what, given)
+        many = [kind(x) for x in many]
+        value = many[0] if width == ONE else tuple(many)
+        object.__setattr__(self, name, value)
+        return value
 
     def _require(self, name: str, holds: bool, what: str, value: Any) -> None:
         if not holds:

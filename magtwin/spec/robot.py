@@ -1,15 +1,15 @@
 """A robot: its USD asset, drive, sensors and magnetic field; and its place in a scene."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from magtwin.frames import IDENTITY_XYZW, quat_multiply
+from magtwin.frames import IDENTITY_XYZW, quat_multiply, rotate
 from magtwin.report.summary import Summarized, Summary
 from magtwin.spec.base import LATER, ZERO3, Quat, Spec, Vec3
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import PlatformFieldSpec
 from magtwin.spec.plant import PlantSpec
-from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec
+from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec, MountSpec
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -56,6 +56,27 @@ class RobotSpec(Summarized, Spec):
         super().__post_init__()
         self._above_zero("footprint_radius_m")
         self._unit("q_base_magnetometer_link_xyzw", "q_base_imu_link_xyzw", "q_base_lidar_link_xyzw")
+
+    def with_part(self, name: str, spec: Spec) -> "RobotSpec":
+        """The robot with another drive, battery, platform, sensor or plant.
+
+        Args:
+            name: Field of the robot, such as "magnetometer".
+            spec: Its new value. A sensor stays on its link, and may move there.
+
+        Raises:
+            InputError: The sensor is on another link, whose place only the asset knows.
+        """
+        before, moved = getattr(self, name), {}
+        if isinstance(spec, MountSpec):
+            what = f"stay {before.link!r}, on which the robot's asset has it"
+            spec._require("link", spec.link == before.link, what, spec.link)
+            if name in ("magnetometer", "lidar") and spec.p_link_sensor != before.p_link_sensor:
+                off = [a - b for a, b in zip(spec.p_link_sensor, before.p_link_sensor, strict=True)]
+                turned = rotate(getattr(self, f"q_base_{name}_link_xyzw"), off)
+                p = tuple((turned + getattr(self, f"p_base_{name}")).tolist())
+                moved = {f"p_base_{name}": p}
+        return replace(self, **{name: spec}, **moved)  # type: ignore[arg-type]
 
     @property
     def q_base_magnetometer_xyzw(self) -> Quat:

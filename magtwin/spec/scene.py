@@ -1,7 +1,11 @@
 """A scene: lab, magnetised things, map and robots."""
 
+import importlib
+import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from magtwin.errors import find
 from magtwin.report.summary import Summarized, Summary, listed
@@ -10,6 +14,9 @@ from magtwin.spec.furniture import FurnitureSpec, steel_of
 from magtwin.spec.lab import LabSpec
 from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
 from magtwin.spec.robot import PlacedRobot, RobotSpec
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -64,6 +71,40 @@ class Scene(Summarized, Spec):
         placed = find("robot", name, {placed.robot.name: placed for placed in self.robots})
         rest = tuple(other for other in self.robots if other.robot.name != name)
         return replace(self, robot=placed.robot, start=placed.start, path=placed.path, others=rest)
+
+    def with_(self, changes: Mapping[str, Any] | None = None, **values: Any) -> "Scene":
+        """The scene with something changed. The map stays: `open_twin` warns where and by how much it is off.
+
+        Args:
+            changes: New values by their way from the scene, as in {"furniture.desk.p_world": (1, 0, 0),
+                "furniture.*.magnetization": (), "robot.magnetometer.rate_hz": 20}. A piece of furniture, a
+                source, wall, door or window is named by its name, of which * stands for any part; None in
+                place of it removes it. `yaw` [rad] turns what has an orientation.
+            **values: New values of fields, such as name="b" or earth=EarthFieldSpec(...). `map_layer` may be
+                an `AnomalyMap`: `scene.with_(map_layer=magtwin.survey(scene))` has a fresh one.
+
+        Raises:
+            InputError: There is no such field or thing; a value has the wrong type or size, or a piece of
+                furniture does not stand on the floor.
+        """
+        made: Scene = importlib.import_module("magtwin.author.rooms").changed(
+            self, {**(changes or {}), **values}
+        )
+        return made
+
+    def to_toml(self, out: str | os.PathLike[str] | None = None, *, force: bool = False) -> str:
+        """The scene as the text of a TOML, of which `magtwin.scene_from_toml` makes the same scene.
+
+        Args:
+            out: File to write it to as well.
+            force: Whether to replace a file that exists.
+        """
+        tables = importlib.import_module("magtwin.author.tables").table_of_scene(self)
+        return str(importlib.import_module("magtwin.author.rooms").written(tables, out, force))
+
+    def plot(self) -> "Figure":
+        """Draw the room from above, over its map; see `magtwin.plot`."""
+        return importlib.import_module("magtwin").plot(self)  # type: ignore[no-any-return]
 
     def _summary(self) -> Summary:
         """Name and floor; robots; map; field; paths; furniture."""

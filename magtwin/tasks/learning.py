@@ -44,13 +44,14 @@ from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.inference.widen import widened
 from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.predictor import Predictor, load_predictor
-from magtwin.learn.training.result import widened_card
+from magtwin.learn.training.result import TrainingResult, widened_card
 from magtwin.run.run import Run
 from magtwin.spec.scene import Scene
 from magtwin.twin import check_scene, in_session_of, open_twin
 from magtwin.usd.scene import read_scene
 
 File = str | os.PathLike[str]
+Model = File | Predictor | Candidate | TrainingResult
 By = Literal["metadata", "file", "folder"]
 Progress = Callable[[int, int, str], Any]
 
@@ -142,7 +143,7 @@ def sources_of_files(
 
 
 def evaluate(
-    models: Sequence[File | Predictor | Candidate] | File | Predictor | Candidate,
+    models: Sequence[Model] | Model,
     recordings: Dataset | Mapping[str, Run] | Sequence[File] | File,
     *,
     anomaly_map: Sequence[AnomalyMap | File] | AnomalyMap | File,
@@ -157,7 +158,7 @@ def evaluate(
     """Measure the errors of models on recordings that they never saw.
 
     Args:
-        models: Weights files, predictors or candidates.
+        models: Weights files, predictors, candidates, or what `magtwin.train` gives.
         recordings: A data set or its folder, a mapping of runs by name, or files of runs. If it is a data
             set, only those recordings are used that were not in the training data of any model.
         anomaly_map: Maps that the models were trained on. The map of each model is identified by its
@@ -181,8 +182,9 @@ def evaluate(
     if seed < 0:
         raise InputError(f"seed must be a whole number from 0 up, got {seed!r}")
     maps = _named_maps([anomaly_map] if _single(anomaly_map) else anomaly_map)  # type: ignore[arg-type,list-item]
-    alone = _single(models) or isinstance(models, Candidate | Predictor)
+    alone = _single(models) or isinstance(models, Candidate | Predictor | TrainingResult)
     given: list[Any] = [models] if alone else list(models)  # type: ignore[arg-type]
+    given = [model.predictor if isinstance(model, TrainingResult) else model for model in given]
     files = iter(short_names([Path(model) for model in given if _single(model)]))
     candidates = []
     for model in given:

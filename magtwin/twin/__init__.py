@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from magtwin.twin.authoring import *  # noqa: F403
+    from magtwin.twin.maps import *  # noqa: F403
     from magtwin.twin.opening import *  # noqa: F403
     from magtwin.twin.robot_scene import *  # noqa: F403
     from magtwin.twin.robots import *  # noqa: F403
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
 
 _NAMES = {
     "authoring": "author_scene new_scene scene_from_toml",
-    "opening": "check_scene lab_and_map led_by locate open_twin scene_of twin_of",
+    "opening": "check_scene lab_and_map led_by locate open_twin open_unwritten scene_of twin_of",
+    "maps": "survey",
     "robot_scene": "scene_with_robot",
     "robots": "simulate_robots",
     "simulation": "engine_named scan simulate",

@@ -1,14 +1,19 @@
 """Authoring: a scene from its TOML, surveyed and checked against its own sources."""
 
+import base64
+import hashlib
+import importlib
+import logging
 import tempfile
 from collections.abc import Callable
+from html import escape
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
 
 from magtwin.errors import InputError, find
 from magtwin.files.file import sha256, shipped
 from magtwin.files.kinds import expected
-from magtwin.files.outputs import check_free, output
+from magtwin.files.outputs import WORKSHOP, check_free, output
 from magtwin.files.settings import copy_schemas
 from magtwin.spec.lab import SurveySpec
 from magtwin.spec.obstacles import Obstacles
@@ -16,6 +21,11 @@ from magtwin.spec.scene import Scene
 
 if TYPE_CHECKING:
     from tempfile import TemporaryDirectory
+
+    from matplotlib.figure import Figure
+
+    from magtwin.author import rooms
+    from magtwin.twin.twin import Place
 
 NOTED_NT = 50.0
 """RMS difference of a map from its sources that is reported [nT]; above the error of a careful survey."""
@@ -27,17 +37,20 @@ _WORKSHOPS: "list[TemporaryDirectory[str]]" = []
 """Temporary folders of scenes, deleted when Python ends."""
 
 Report = Callable[[str], Any]
+TOLD: Report = logging.getLogger("magtwin").info
+"""Who is told by default: who listens to the logger."""
+
 Progress = Callable[[int, int, str], Any]
 
 
 def new_workshop() -> str:
     """A temporary folder, deleted when Python ends."""
-    _WORKSHOPS.append(tempfile.TemporaryDirectory(prefix="magtwin-"))
+    _WORKSHOPS.append(tempfile.TemporaryDirectory(prefix=WORKSHOP))
     return _WORKSHOPS[-1].name
 
 
 def scene_from_toml(
-    path: str | FilePath,
+    path: "str | FilePath | rooms.Room",
     *,
     map_layer: str | FilePath | None = None,
     network: str | FilePath | None = None,
@@ -45,7 +58,7 @@ def scene_from_toml(
     robot: FilePath | None = None,
     name: str = "",
     scale: float = 1.0,
-    report: Report = lambda text: None,
+    report: Report = TOLD,
     progress: Progress = lambda done, total, what: None,
 ) -> Scene:
     """Read the TOML of a scene.
@@ -54,8 +67,8 @@ def scene_from_toml(
     and also an Earth field, sources or furniture, the map is compared with their field.
 
     Args:
-        path: The TOML, or the name of a scene that ships with magtwin ("lab", "aprilab"). File names in it
-            are relative to its folder.
+        path: The TOML, or the name of a scene that ships with magtwin ("lab", "aprilab"), or a `Room`. File
+            names in a TOML are relative to its folder.
         map_layer: Map that replaces the one of the TOML.
         network: Weights (.safetensors or .pth) that replace those of the TOML.
         workshop: Folder for a robot converted from a URDF and for the map of a survey. Default: a temporary
@@ -63,7 +76,8 @@ def scene_from_toml(
         robot: USD asset of a robot that replaces those of the TOML, see `scene_with_robot`.
         name: Name of the scene, in place of the TOML's.
         scale: Factor on the floor and on the places of furniture and sources; their sizes stay.
-        report: Called with a line about the survey, and about a map that differs from the sources.
+        report: Called with a line about the survey, and about a map that differs from the sources. Default:
+            the logger "magtwin".
         progress: Called during a survey with headings done, headings in all, and the current step.
 
     Raises:
@@ -87,16 +101,26 @@ def scene_from_toml(
         from magtwin.sim.survey import survey_room
         from magtwin.usd.maps.layer import save_map
 
-        source = f"{FilePath(path).name} sha256:{sha256(path)}"
+        source = f"{where.name} sha256:{checksum}"
         surveyed = survey_room(scene, spec, seed=seed, obstacles=obstacles, source=source, progress=progress)
         layer = FilePath(workshop) / f"{scene.name}.map.usdc"
         save_map(surveyed.field, layer)
         report(f"{scene.name} names no map: {surveyed}")
         return layer
 
-    path = expected(_file_of(path), "TOML of a scene")
+    tables: Any = None
+    if isinstance(path, str | FilePath):
+        where = expected(_file_of(path), "TOML of a scene")
+        checksum = sha256(where)
+    else:
+        tables = path.tables
+        where, checksum = (
+            FilePath(f"room {tables['name']!r}"),
+            hashlib.sha256(path.to_toml().encode()).hexdigest(),
+        )
     scene = read_toml_scene(
-        path,
+        where,
+        table=tables,
         map_layer=map_layer,
         network=network,
         workshop=workshop,
@@ -107,8 +131,8 @@ def scene_from_toml(
         survey_of=survey_of,
     )
     if scene.map_layer.parent != FilePath(workshop):
-        where = f"{path} with {map_layer or scene.map_layer.name}"
-        difference = check_agrees(scene, load_map(scene.map_layer), where)
+        what = f"{where} with {map_layer or scene.map_layer.name}"
+        difference = check_agrees(scene, load_map(scene.map_layer), what)
         if difference and difference.rms_nt >= NOTED_NT:
             report(f"Note: the map differs from the field of the scene's sources by {difference}")
     return scene
@@ -123,20 +147,49 @@ def _file_of(path: str | FilePath) -> FilePath:
     return file if file.exists() and str(path) not in known else find("scene", str(path), known)
 
 
+if TYPE_CHECKING:
+    _Path = FilePath
+else:
+    _Path = type(FilePath())  # before Python 3.12, only this has subclasses
+
+
+class Authored(_Path):
+    """The root layer of a scene that was written: a path, which also shows the scene."""
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of the stage, as it is now."""
+        return importlib.import_module("magtwin").read_scene(FilePath(self))  # type: ignore[no-any-return]
+
+    def plot(self) -> "Figure":
+        """Draw the room from above, over its map; see `magtwin.plot`."""
+        return self.scene.plot()
+
+    def _repr_html_(self) -> str | None:
+        if not self.is_file():  # such as a folder of it
+            return None
+        figure = self.plot()
+        picture = base64.b64encode(figure._repr_png_()).decode()  # type: ignore[attr-defined]
+        shown = (
+            f'<img alt="the room from above" style="max-width:100%" src="data:image/png;base64,{picture}"/>'
+        )
+        return f"{self.scene._repr_html_()}{shown}<p>{escape(str(self))}</p>"
+
+
 def author_scene(
-    scene: Scene | str | FilePath,
+    scene: "Place",
     out: str | FilePath,
     *,
     map_layer: str | FilePath | None = None,
     network: str | FilePath | None = None,
     force: bool = False,
-    report: Report = lambda text: None,
+    report: Report = TOLD,
     progress: Progress = lambda done, total, what: None,
-) -> FilePath:
+) -> Authored:
     """Write a scene as a folder of USD layers that needs no file outside it.
 
     Args:
-        scene: A `Scene`, or a TOML as for `scene_from_toml`.
+        scene: A `Scene` or a `Room`, or a TOML as for `scene_from_toml`.
         out: Folder to make.
         map_layer: As for `scene_from_toml`, if `scene` is a TOML.
         network: As for `scene_from_toml`, if `scene` is a TOML.
@@ -145,7 +198,8 @@ def author_scene(
         progress: As for `scene_from_toml`.
 
     Returns:
-        The root layer, `out/<name>.usda`.
+        The root layer, `out/<name>.usda`: a path that also has `scene` and `plot`, and shows itself in a
+        notebook.
 
     Raises:
         InputError: The folder exists, or as for `scene_from_toml`.
@@ -153,13 +207,31 @@ def author_scene(
     from magtwin.author.scene import author_scene as write_scene
 
     check_free(out, force=force)
-    if isinstance(scene, Scene):
-        return write_scene(scene, out, force=force)
-    with tempfile.TemporaryDirectory() as workshop:
-        read = scene_from_toml(
-            scene, map_layer=map_layer, network=network, workshop=workshop, report=report, progress=progress
+    if isinstance(scene, str | FilePath):
+        with tempfile.TemporaryDirectory() as workshop:
+            read = scene_from_toml(
+                scene,
+                map_layer=map_layer,
+                network=network,
+                workshop=workshop,
+                report=report,
+                progress=progress,
+            )
+            return Authored(write_scene(read, out, force=force))
+    if map_layer is not None or network is not None:
+        raise InputError(
+            "map_layer and network are for a TOML; use with_() on a Scene", parameter="map_layer"
         )
-        return write_scene(read, out, force=force)
+    made = scene if isinstance(scene, Scene) else _made(scene)
+    return Authored(write_scene(made, out, force=force))
+
+
+def _made(scene: Any) -> Scene:
+    if hasattr(scene, "GetRootLayer"):
+        return importlib.import_module("magtwin").read_scene(scene)  # type: ignore[no-any-return]
+    if not hasattr(type(scene), "scene"):
+        raise InputError(f"scene must be a Scene, a Room, a stage or a TOML, got {type(scene).__name__}")
+    return scene.scene  # type: ignore[no-any-return]
 
 
 def new_scene(

@@ -1,6 +1,8 @@
 """Surveys of scenes: the readings that the robot of a scene would take, and the map that it would make."""
 
+import importlib
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import radians
@@ -8,18 +10,59 @@ from typing import Any
 
 import numpy as np
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, MismatchWarning
+from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.survey.saved import save_readings
 from magtwin.files.file import sha256
 from magtwin.files.outputs import check_free, output, transaction
+from magtwin.files.settings import from_values
 from magtwin.report.report import Report
-from magtwin.sim.survey import blocked_by, survey, survey_readings
+from magtwin.sim.survey import blocked_by, survey_readings, survey_room
+from magtwin.sim.survey import survey as survey_nodes
+from magtwin.spec.lab import SurveySpec
+from magtwin.spec.scene import Scene
+from magtwin.twin.opening import open_twin
+from magtwin.twin.twin import Place, Twin
 from magtwin.usd.layers import check_not_part, layer_files
 from magtwin.usd.maps.layer import save_map
 from magtwin.usd.scene import open_scene, use_map
 
 Source = str | os.PathLike[str]
 Progress = Callable[..., None]
+
+
+def survey(scene: Twin | Place, *, seed: int = 0, **survey: Any) -> AnomalyMap:
+    """Survey a scene: the map that its own robot would make, standing at each node of a grid in each heading.
+
+    Nodes that the robot cannot reach are filled from their neighbours.
+
+    Args:
+        scene: An opened twin, or a scene as for `open_twin`, with a known Earth field.
+        seed: Seed of the sensor's noise, and of the errors of the robot's poses.
+        **survey: Fields of `SurveySpec`: spacing_m, headings_deg, readings, height_m, heading_error_deg,
+            position_error_m.
+
+    Returns:
+        The map. `scene.with_(map_layer=map)` is the scene that reads it, `map.save("map.usdc")` its layer.
+
+    Raises:
+        InputError: The scene has no Earth field, or a number is out of range.
+    """
+    spec = from_values(SurveySpec, survey, "survey")
+    if hasattr(type(scene), "scene") and not isinstance(scene, str | os.PathLike):  # a room
+        scene = scene.scene  # type: ignore[union-attr]
+    if isinstance(scene, Scene):
+        obstacles = importlib.import_module("magtwin.author.room").obstacles_in(scene.lab, scene.furniture)
+    else:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MismatchWarning)  # the old map is not read
+            twin = scene if isinstance(scene, Twin) else open_twin(scene, magnetometer="physical")
+        scene, obstacles = twin.scene, twin.obstacles
+    if scene.earth is None:
+        raise InputError(
+            f"scene {scene.name!r} has no Earth field, so its field is known nowhere but in its map"
+        )
+    return survey_room(scene, spec, seed=seed, obstacles=obstacles, source=scene.name).field
 
 
 def survey_scene(
@@ -101,7 +144,7 @@ def survey_scene(
         surveyed = replace(survey_readings(twin, **options), name=name or out.stem)
         save_readings(surveyed, out, force=force)
         return surveyed.report()
-    field = survey(twin, **options, name=name or out.stem)
+    field = survey_nodes(twin, **options, name=name or out.stem)
     field = replace(field, parameters={**field.parameters, "seed": seed})
     with transaction(), output(out, force=force) as aside:
         save_map(field, aside)

@@ -3,11 +3,12 @@
 import dataclasses
 import hashlib
 import importlib
+import logging
 import shutil
 import tempfile
 import warnings
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,8 @@ from magtwin.spec.scene import Scene
 from magtwin.twin.twin import (
     Kind,
     Metadata,
+    Network,
+    Place,
     Twin,
     scene_sha256,
     without_tracking_error,
@@ -31,15 +34,26 @@ if TYPE_CHECKING:
     from magtwin.usd.geometry import Link, Shape
     from magtwin.usd.scene import OpenedScene
 
+LOG = logging.getLogger("magtwin")
+
+SAME_PLACE_M = 1e-9
+"""Places of a sensor that differ by less are the same [m]."""
+
+SURVEY_FILE = "magtwin map survey {file} --out MAP.usdc --adopt"
+SURVEY_SCENE = "scene.with_(map_layer=magtwin.survey(scene))"
+
+UNWRITTEN = "unwritten"
+"""`Twin.stage` of a scene of which no stage was written."""
+
 _CHECKSUMS = {"map_sha256": "its map", "network_sha256": "its network", "scene_sha256": "the scene"}
 
 
 def open_twin(
-    scene: Scene | str | FilePath,
+    scene: Place,
     *,
     lab: str = "",
     map_layer: str | FilePath | None = None,
-    network: str | FilePath | None = None,
+    network: Network = None,
     magnetometer: Kind | None = None,
     model_error: bool = True,
     tracking_error: bool = True,
@@ -53,14 +67,14 @@ def open_twin(
     `network_mismatch`. So does a map that was made before the stage was changed, as `map_mismatch`.
 
     Args:
-        scene: Root layer or folder of a scene, the name of one that ships ("lab"), or a `Scene`, which is
-            written to a temporary folder first. Colliders added to a stage by hand are not part of a
-            `Scene`.
+        scene: Root layer or folder of a scene; the name of one that ships ("lab"); a `pxr.Usd.Stage`, with
+            its changes that are not saved; or a `Scene` or a `Room`, which is written to a temporary folder
+            first. Colliders added to a stage by hand are not part of a `Scene`.
         lab: Path of the lab's root prim on a stage of several labs. Default: the only lab.
         map_layer: Map that replaces the scene's, such as one of the same room on another day. What shows the
             stage still shows the stage's own map.
-        network: Weights (.safetensors or .pth) that replace those of the scene; or "none" for a physical
-            magnetometer.
+        network: Weights (.safetensors or .pth) that replace those of the scene; a predictor, or what
+            `magtwin.train` gives; or "none" for a physical magnetometer.
         magnetometer: Kind that replaces the scene's: "physical", "neural" or "map-only".
         model_error: Whether a random model error is added to the readings of a neural magnetometer, as large
             as the network's error on recordings outside its training set; see
@@ -72,16 +86,101 @@ def open_twin(
     Raises:
         InputError: The stage, its map or its weights are missing or broken, or a checksum does not match.
     """
+    network = _weights_file(network)
     options: Any = {"network": network, "magnetometer": magnetometer, "model_error": model_error}
     options["tracking_error"] = tracking_error
+    if not isinstance(scene, str | FilePath | Scene) and not hasattr(scene, "GetRootLayer"):
+        if not hasattr(type(scene), "scene"):
+            kind = type(scene).__name__
+            raise InputError(
+                f"scene must be a Scene, a Room, a stage or its file, got {kind}", parameter="scene"
+            )
+        scene = scene.scene  # type: ignore[union-attr]
     if isinstance(scene, Scene):
         return _open_in_memory(scene, map_layer=map_layer, **options)  # has one lab
-    from magtwin.usd.layers import layer_sha256
-    from magtwin.usd.scene import open_scene
+    from magtwin.usd.scene import open_scene, saved_as
 
-    file = scene_file(scene)
     neural = network is None and magnetometer in (None, "neural")
-    stage = open_scene(file, lab=lab, map_layer=map_layer, check_network=neural)
+    own: Any = {"lab": lab, "map_layer": map_layer, "check_network": neural}
+    metadata: Metadata = {}
+    if not isinstance(scene, str | FilePath):
+        file = saved_as(scene)
+        if file is None:  # as it is in this process
+            return _twin_of(open_scene(scene, **own), metadata, map_layer=map_layer, **options)
+        scene = file
+    file = scene_file(scene)
+    stage = open_scene(file, **own)
+    metadata = {"scene_file": file.as_posix(), "scene_sha256": stage.sha256}
+    if revision := git_revision(file.parent):
+        metadata["git_revision"] = revision
+    return _twin_of(stage, metadata, map_layer=map_layer, again=SURVEY_FILE.format(file=file), **options)
+
+
+def open_unwritten(
+    scene: Scene, known: dict[object, Any], *, network: Network = None, **options: Any
+) -> Twin:
+    """As `open_twin` of a scene in memory, without writing a stage: for many scenes.
+
+    Args:
+        scene: The scene.
+        known: Maps and robots that other scenes have as well; it is filled.
+        network: As for `open_twin`.
+        **options: As for `open_twin`.
+    """
+    from magtwin.field.maps.scene_state import changes_since
+    from magtwin.usd.layers import layer_sha256
+    from magtwin.usd.maps.layer import load_map
+    from magtwin.usd.robot import load_robot
+    from magtwin.usd.scene import OpenedScene, check_map
+
+    def once(key: object, make: Callable[[], Any]) -> Any:
+        if key not in known:
+            known[key] = make()
+        return known[key]
+
+    def placed(robot: RobotSpec) -> RobotSpec:
+        asset = once(robot.asset, lambda: load_robot(robot.asset))
+        for part in ("magnetometer", "lidar"):
+            name = f"p_base_{part}"
+            where = getattr(asset.with_part(part, getattr(robot, part)), name)
+            if max(abs(a - b) for a, b in zip(where, getattr(robot, name), strict=True)) > SAME_PLACE_M:
+                robot = dataclasses.replace(robot, **{name: where})
+        return robot
+
+    author = importlib.import_module("magtwin.author.room")  # by name: who opens a stage needs no author
+    importlib.import_module("magtwin.author.scene").check_things(scene)
+    others = tuple(dataclasses.replace(other, robot=placed(other.robot)) for other in scene.others)
+    scene = dataclasses.replace(scene, robot=placed(scene.robot), others=others)
+    checksum = once((scene.map_layer, "sha256"), lambda: layer_sha256(scene.map_layer))
+    if scene.map_sha256 not in ("", checksum):
+        check_map(scene)
+    scene = dataclasses.replace(scene, map_sha256=checksum)
+    field = once(scene.map_layer, lambda: load_map(scene.map_layer))
+    made = field.made_from
+    changes = () if made is None else tuple(changes_since(made, scene))
+    stage = OpenedScene(FilePath(scene.name), None, scene, field, changes=changes)
+    standing = (scene.lab, scene.furniture)
+    stage.__dict__["obstacles"] = once(standing, lambda: author.obstacles_in(*standing))
+    twin = _twin_of(stage, {}, map_layer=None, network=_weights_file(network), **options)
+    return dataclasses.replace(twin, opened=None, stage=UNWRITTEN)
+
+
+def _twin_of(
+    stage: "OpenedScene",
+    metadata: Metadata,
+    *,
+    map_layer: str | FilePath | None,
+    network: str | FilePath | None,
+    magnetometer: Kind | None = None,
+    model_error: bool = True,
+    tracking_error: bool = True,
+    again: str = SURVEY_SCENE,
+) -> Twin:
+    """The twin of an opened scene; as for `open_twin`, what is known of its files, and how to survey
+    it again.
+    """
+    from magtwin.usd.layers import layer_sha256
+
     read = stage.scene
     read = dataclasses.replace(
         read,
@@ -92,37 +191,39 @@ def open_twin(
         ),
     )
     field, predictor = stage.map, _magnetometer(read)
-    metadata: Metadata = {"scene_file": file.as_posix(), "scene_sha256": stage.sha256}
-    if revision := git_revision(file.parent):
-        metadata["git_revision"] = revision
-    metadata |= {"map": field.name, "map_sha256": layer_sha256(read.map_layer)}
+    if stage.stage is not None and "scene_sha256" not in metadata:
+        metadata["scene_sha256"] = stage.sha256
+    checksum = read.map_sha256 if stage.stage is None else layer_sha256(read.map_layer)
+    metadata |= {"map": field.name, "map_sha256": checksum}
     if stage.lab:
         metadata["lab"] = stage.lab
     if map_layer is not None:
         metadata["map_file"] = FilePath(map_layer).as_posix()
     if stage.pose is not None:
         metadata["lab_pose"] = " ".join(map(repr, (*stage.pose.p, stage.pose.yaw)))
-    stale = [_stale(stage)] if stage.changes else []
+    stale = [_stale(stage, again)] if stage.changes else []
     for text in stale:  # a run has the same bytes wherever its stage lies
         metadata["map_mismatch"] = text.replace(str(stage.file), stage.file.name)
     for text in (*stage.notes, *stale):
-        warnings.warn(text, MismatchWarning, stacklevel=2)
+        warnings.warn(text, MismatchWarning, stacklevel=3)
     platforms = {placed.robot.name: _platform_sha256(placed.robot) for placed in read.robots}
     metadata["platform_sha256"] = platforms[read.robot.name]
-    twin = Twin(read, file, field, predictor, stage.obstacles, metadata, platforms, model_error, opened=stage)
+    obstacles = stage.obstacles
+    twin = Twin(read, stage.file, field, predictor, obstacles, metadata, platforms, model_error, opened=stage)
     twin = _with_network(twin if tracking_error else without_tracking_error(twin))
+    LOG.info("opened %s: map %s, %d obstacles", read.name, field.name, len(obstacles))
     if predictor and network is not None:
         named = {**twin.metadata, "network_file": FilePath(network).as_posix()}
         return dataclasses.replace(twin, metadata=named)
     return twin
 
 
-def _stale(stage: "OpenedScene") -> str:
+def _stale(stage: "OpenedScene", again: str) -> str:
     """What has changed since the map was made, by how much the map is off, and what to do."""
     from magtwin.sim.contradiction import contradiction_nt
 
     scene, effect = stage.scene, ""
-    advice = f"survey again: magtwin map survey {stage.file} --out MAP.usdc --adopt"
+    advice = f"survey again: {again}"
     if scene.earth is None:
         advice = "make a map with this robot in this room"
     else:
@@ -143,11 +244,29 @@ def geometry(twin: Twin) -> "tuple[list[Shape], dict[str, Link]]":
     from magtwin.usd.scene import open_alone
 
     name = twin.scene.robot.name
+    if twin.stage == UNWRITTEN:
+        with warnings.catch_warnings():  # what it would warn of was told when the twin was opened
+            warnings.simplefilter("ignore", MismatchWarning)
+            return geometry(open_twin(twin.scene, network="none"))
     if twin.opened is not None:
         alone = twin.opened.alone(name)
         return alone.shapes, alone.links
     stage = open_alone(twin.scene_file, name, lab=str(twin.metadata.get("lab", "")))
     return list(read_shapes(stage)), read_links(stage)
+
+
+def _weights_file(network: Network) -> str | FilePath | None:
+    """The file of a network; one that is in memory is written to a temporary folder."""
+    predictor: Any = getattr(network, "predictor", network)
+    if predictor is None or isinstance(predictor, str | FilePath):
+        return predictor
+    if not hasattr(predictor, "residual_sd_nt"):
+        kind = type(network).__name__
+        raise InputError(f"network must be a weights file or a predictor, got {kind}", parameter="network")
+    name = str(getattr(predictor, "name", predictor.kind)).rpartition(":")[2].rpartition(".")[2]
+    folder = FilePath(importlib.import_module("magtwin.twin.authoring").new_workshop())
+    predictor.save(folder / f"{name}.safetensors")
+    return folder / f"{name}.safetensors"
 
 
 class _TemporaryStage:
@@ -161,13 +280,19 @@ class _TemporaryStage:
         return FilePath, (str(self.folder),)  # a copy in another process must not delete it
 
 
-def _open_in_memory(scene: Scene, **options: Any) -> Twin:
+def _open_in_memory(scene: Scene, *, map_layer: str | FilePath | None, **options: Any) -> Twin:
     """The twin of a scene without a file, authored to a temporary folder."""
+    from magtwin.usd.scene import open_scene
+
     stage = _TemporaryStage()
     author = importlib.import_module("magtwin.author.scene")  # by name: who opens a stage needs no author
-    twin = open_twin(author.author_scene(scene, stage.folder / "scene"), **options)
-    metadata = {name: value for name, value in twin.metadata.items() if name != "scene_file"}
-    return dataclasses.replace(twin, metadata=metadata, stage=stage)
+    file = author.author_scene(scene, stage.folder / "scene")
+    neural = options["network"] is None and options["magnetometer"] in (None, "neural")
+    opened = open_scene(file, map_layer=map_layer, check_network=neural)
+    named = dataclasses.replace(opened, file=FilePath(file.name))  # nobody needs to know the temporary folder
+    metadata: Metadata = {"scene_sha256": opened.sha256}
+    twin = _twin_of(named, metadata, map_layer=map_layer, **options)
+    return dataclasses.replace(twin, scene_file=file, opened=opened, stage=stage)
 
 
 def _platform_sha256(robot: RobotSpec) -> str:

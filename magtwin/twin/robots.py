@@ -12,18 +12,17 @@ from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.motion.drive_input import drive_input
 from magtwin.spec.plant import PlantSpec
-from magtwin.spec.scene import Scene
 from magtwin.twin.opening import led_by
 from magtwin.twin.session import in_session, room_of, with_plant
 from magtwin.twin.simulation import check_commands, finisher
-from magtwin.twin.twin import Kind, Session, Twin, checked_seed, opened
+from magtwin.twin.twin import Kind, Network, Place, Session, Twin, checked_seed, opened
 
 if TYPE_CHECKING:
     from magtwin.sim.motion.commands import Commands
 
 
 def simulate_robots(
-    twin: Twin | Scene | str | FilePath,
+    twin: Twin | Place,
     paths: "Mapping[str, Path | Commands | Run | str | FilePath | ArrayLike] | None" = None,
     *,
     robots: Iterable[str] | None = None,
@@ -34,7 +33,7 @@ def simulate_robots(
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
-    network: str | FilePath | None = None,
+    network: Network = None,
     magnetometer: Kind | None = None,
     model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",
@@ -49,7 +48,7 @@ def simulate_robots(
     with the same seed; each other robot has a generator of its own.
 
     Args:
-        twin: An opened twin, a `Scene`, or the file of a stage.
+        twin: An opened twin, or a scene as for `open_twin`.
         paths: What each robot drives, by name, as for `simulate`. Default: the path in the scene, else
             "figure8".
         robots: Names of the robots whose sensors are read. Default: all. All robots drive.

@@ -14,9 +14,19 @@ from magtwin.report.verdict import OWN
 from magtwin.run.run import Run
 from magtwin.sim.motion.drive_input import DriveInput, drive_input, path_metadata
 from magtwin.spec.plant import PlantSpec
-from magtwin.spec.scene import Scene
 from magtwin.twin.session import in_session, in_session_of, model_error_of, room_of, trained_on, with_plant
-from magtwin.twin.twin import OF_SCENE, Kind, Metadata, Session, Twin, checked_seed, opened, scene_sha256
+from magtwin.twin.twin import (
+    OF_SCENE,
+    Kind,
+    Metadata,
+    Network,
+    Place,
+    Session,
+    Twin,
+    checked_seed,
+    opened,
+    scene_sha256,
+)
 from magtwin.version import __version__
 
 if TYPE_CHECKING:
@@ -34,7 +44,7 @@ _ON_STAGE = {"newton": "magtwin.twin.physics:newton"}
 
 
 def simulate(
-    twin: Twin | Scene | str | FilePath,
+    twin: Twin | Place,
     path: "Path | Commands | Run | str | FilePath | ArrayLike" = "figure8",
     *,
     seed: int = 0,
@@ -43,7 +53,7 @@ def simulate(
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
-    network: str | FilePath | None = None,
+    network: Network = None,
     magnetometer: Kind | None = None,
     model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",
@@ -58,7 +68,7 @@ def simulate(
     """Drive the scene's robot along a path and read every sensor.
 
     Args:
-        twin: An opened twin, a `Scene`, or the file of a stage.
+        twin: An opened twin, or a scene as for `open_twin`.
         path: What to drive: the name of a path, a CSV file of x, y [m], points in world [m], shape (N, 2), or
             a `Path`; "random" for a random drive; `Commands` to play back; or a `Run` to drive again as
             recorded, with the scene's sensors.
@@ -129,7 +139,7 @@ def simulate(
     return run
 
 
-def scan(twin: Twin | Scene | str | FilePath, run: Run, *, seed: int = 0) -> "Scans":
+def scan(twin: Twin | Place, run: Run, *, seed: int = 0) -> "Scans":
     """The scans of the robot's LiDAR during a run, one per revolution while it was on.
 
     Args:

@@ -2,30 +2,41 @@
 
 import dataclasses
 import functools
+import importlib
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from magtwin.errors import InputError, RepairWarning
-from magtwin.field.maps.map import AnomalyMap
+from magtwin.errors import InputError, MismatchWarning, RepairWarning
 from magtwin.path import Path
 from magtwin.run.run import Run
-from magtwin.sim.motion.drive_input import drive_inputs, path_metadata
+from magtwin.sim.motion.drive_input import DriveInput, drive_input, each_input, path_metadata
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.twin.session import in_session, model_error_of, room_of, trained_on, with_plant
 from magtwin.twin.simulation import check_commands, finished, stated
-from magtwin.twin.twin import Kind, Twin, checked_seed, opened, scene_sha256, without_model_error
+from magtwin.twin.twin import (
+    Kind,
+    Network,
+    Place,
+    Twin,
+    checked_seed,
+    opened,
+    scene_sha256,
+    without_model_error,
+)
 
 if TYPE_CHECKING:
-    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+    from magtwin.learn.inference.magnetometer import Read
     from magtwin.sim.motion.commands import Commands
     from magtwin.sim.runs.batch import Job, Runs
+    from magtwin.sim.runs.sensing import Conditions
     from magtwin.sim.runs.simulate import Sensed
 
 MIXTURE = ("sine", "lawnmower", "figure8", "continuous_cycle", "random")
@@ -47,9 +58,9 @@ def check_count(count: int) -> None:
 
 
 def sweep(
-    twin: Twin | Scene | str | FilePath,
+    twin: Twin | Place | Iterable[Twin | Place],
     paths: "Path | Commands | Run | str | FilePath | ArrayLike | Iterable[Any] | None" = None,
-    seeds: int | Iterable[int] = 100,
+    seeds: int | Iterable[int] | None = None,
     *,
     seed: int = 0,
     sessions: int | Literal["survey"] | None = None,
@@ -60,24 +71,26 @@ def sweep(
     block: int | None = None,
     duration_s: float | None = None,
     rate_hz: float | None = None,
-    network: str | FilePath | None = None,
+    network: Network = None,
     magnetometer: Kind | None = None,
     model_error: bool = True,
     lidar: Literal["schedule", "on", "off"] = "schedule",
     outside: Literal["nan", "clamp", "raise"] = "nan",
     controller: str = "follower",
 ) -> "Runs":
-    """Simulate many runs, each with the robot alone in the scene.
+    """Simulate many runs, each with the robot alone in its scene: of one scene, or of several.
 
     `sweep(twin, paths, seeds)[i]` equals `simulate(twin, paths[i], seed=seeds[i])` to the bit, whatever the
     number of runs, their order and the block. Everything is checked at once; runs are made when asked for:
     iterate over the result to bound memory, or `save` it to a folder.
 
     Args:
-        twin: An opened twin, a `Scene`, or the file of a stage.
+        twin: An opened twin, or a scene as for `open_twin`; or several of them, taken in turn, such as
+            variants that `Scene.with_` gives. A `Scene` among several is opened without writing its stage.
         paths: What to drive, as for `simulate`: one for all runs, or several, taken in turn. Default:
             `magtwin.twin.MIXTURE`.
         seeds: A seed for each run; or the number of runs, whose seeds then are `seed`, `seed` + 1, ...
+            Default: 100 runs of one scene, or one run of each of several.
         seed: First seed if `seeds` is a number. It also draws sessions and speeds.
         sessions: Number of sessions, drawn from `seed`; each takes an equal share of the runs, one after the
             other. "survey" is the robot as it was when the map was surveyed. Default: each run has its own
@@ -107,20 +120,22 @@ def sweep(
     """
     from magtwin.sim.exact import check_field
     from magtwin.sim.runs.batch import BLOCK, Job, Runs
-    from magtwin.sim.runs.sensing import Conditions
     from magtwin.sim.runs.simulate import check_asked
 
-    twin = opened(twin, network, magnetometer, model_error, "sweep")
     if plant is not None and robots is not None:
         raise InputError("robots are used as they are; give robots or plant, not both", parameter="plant")
-    twin = with_plant(twin, plant)
-    check_field(twin.scene, twin.field)
+    bases = _bases(twin, network, magnetometer, model_error)
+    bases = [with_plant(base, plant) for base in bases]
+    for base in bases:
+        check_field(base.scene, base.field)
     if not isinstance(controller, str):
         raise InputError(
             f"controller must be a name, got {type(controller).__name__}; a custom controller has the state "
             "of one run: give it to simulate"
         )
     first = checked_seed(seed)
+    if seeds is None:
+        seeds = 100 if len(bases) == 1 else len(bases)
     if isinstance(seeds, int | np.integer):
         if isinstance(seeds, bool) or seeds < 1:
             raise InputError(f"seeds must be at least one run, got {seeds}")
@@ -128,49 +143,97 @@ def sweep(
         seeds = range(first, first + int(seeds))
     numbers = [checked_seed(number) for number in seeds]
     count = len(numbers)
-    ways = drive_inputs(MIXTURE if paths is None else paths, room_of(twin))
+    ways = _Ways(each_input(MIXTURE if paths is None else paths))
     if robots is not None and sessions is not None:
         raise InputError("robots are used as they are; give robots or sessions, not both")
-    twins = _twins(twin, robots, sessions, numbers, first, model_error)
+    turns = [bases[k % len(bases)] for k in range(count)]
+    twins = _twins(turns, robots, sessions, numbers, first, model_error)
     if isinstance(speeds, str):
         if speeds != "drawn":
             raise InputError(f'speeds must be numbers or "drawn", got {speeds!r}')
-        speeds = _drawn_speeds(twin, count, first)
+        speeds = _drawn_speeds(turns, first)
+    check_asked(duration_s, rate_hz)
+    common: Any = {"duration_s": duration_s, "rate_hz": rate_hz, "controller": controller}
+    common |= {"lidar": lidar, "outside": outside}
+    rooms = {id(base): _conditions(base, common) for base in bases}
     jobs: list[Job] = []
     known: dict[int, tuple[Twin, str]] = {}
-    for k, (number, speed, own) in enumerate(
-        zip(numbers, _each("speeds", speeds, count), twins, strict=True)
-    ):
-        path = ways[k % len(ways)] if isinstance(ways, list) else ways
+    each_speed = _each("speeds", speeds, count)
+    for k, (number, speed, base, own) in enumerate(zip(numbers, each_speed, turns, twins, strict=True)):
+        path = ways.of(k, base)
         if id(own.scene) not in known:
             known[id(own.scene)] = own, scene_sha256(own.scene)
-        check_commands(path, twin.magnetometer)
-        jobs.append(Job(own.scene, path, number, speed))
-    predictor = twin.magnetometer
-    check_asked(duration_s, rate_hz)
-    finish = _Finish(predictor, twin.field, tuple(known.values()), duration_s)
-    conditions = Conditions(
-        anomaly_map=twin.field,
-        obstacles=twin.obstacles,
-        network=predictor is not None,
-        inputs=frozenset(predictor.columns if predictor else ()),
-        duration_s=duration_s,
-        rate_hz=rate_hz,
-        controller=controller,
-        lidar=lidar,
-        outside=outside,
-    )
+        check_commands(path, base.magnetometer)
+        jobs.append(Job(own.scene, path, number, speed, rooms[id(base)]))
+    finish = _Finish(tuple(known.values()), duration_s)
     if block is None:  # fewer runs at a time if they are longer than 10 minutes
         block = max(1, min(BLOCK, int(BLOCK * 600 / (duration_s or 600))))
-    return Runs(jobs, conditions, finish, columns=columns, block=block)
+    return Runs(jobs, finish, columns=columns, block=block)
+
+
+def _bases(twins: Any, network: Network, magnetometer: Kind | None, model_error: bool) -> list[Twin]:
+    """The opened twins of a sweep's first argument. What is told of many scenes is told once."""
+    single = isinstance(twins, str | FilePath | Twin | Scene) or hasattr(twins, "GetRootLayer")
+    if single or not hasattr(twins, "__iter__"):
+        return [opened(twins, network, magnetometer, model_error, "sweep")]
+    made, known, told = list[Twin](), dict[object, Any](), list[str]()
+    for number, each in enumerate(twins):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            try:
+                scene = (
+                    each.scene if hasattr(type(each), "scene") and not isinstance(each, FilePath) else each
+                )
+                if isinstance(scene, Scene):
+                    options: Any = {"network": network, "magnetometer": magnetometer}
+                    open_unwritten = importlib.import_module("magtwin.twin.opening").open_unwritten
+                    made.append(open_unwritten(scene, known, model_error=model_error, **options))
+                else:
+                    made.append(opened(scene, network, magnetometer, model_error, "sweep"))
+            except InputError as error:
+                text = f"scene {number}, counted from 0: {error}"
+                raise InputError(text, parameter=error.parameter) from error
+        told += [f"scene {number}, counted from 0: {warning.message}" for warning in caught]
+    if not made:
+        raise InputError("sweep got no scene", parameter="twin")
+    if told:
+        more = f" (and {len(told) - 1} more warnings of these scenes; each run has its own in its metadata)"
+        warnings.warn(told[0] + more * (len(told) > 1), MismatchWarning, stacklevel=4)
+    return made
+
+
+def _conditions(base: Twin, common: Mapping[str, Any]) -> "Conditions":
+    """What the runs of a twin have in common."""
+    from magtwin.sim.runs.sensing import Conditions
+
+    predictor = base.magnetometer
+    return Conditions(
+        anomaly_map=base.field,
+        obstacles=base.obstacles,
+        network=predictor is not None,
+        inputs=frozenset(predictor.columns if predictor else ()),
+        **common,
+    )
+
+
+class _Ways:
+    """What runs drive, each path placed in the room of its twin once."""
+
+    def __init__(self, paths: list[Any]) -> None:
+        self._paths, self._known = paths, dict[Any, DriveInput]()
+
+    def of(self, number: int, base: Twin) -> DriveInput:
+        """What a run drives in the room of its twin."""
+        path = self._paths[number % len(self._paths)]
+        key = id(base), path if isinstance(path, str | FilePath) else id(path)
+        if key not in self._known:
+            self._known[key] = drive_input(path, room_of(base))
+        return self._known[key]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Finish:
     """Makes whole runs of sensed ones; an object, so that other processes can have it."""
-
-    predictor: "NeuralMagnetometer | None"
-    field: AnomalyMap
 
     twins: tuple[tuple[Twin, str], ...]
     """Twins of the runs, each with the checksum of its scene."""
@@ -178,11 +241,18 @@ class _Finish:
     duration_s: float | None
 
     def __call__(self, jobs: Sequence["Job"], sensed: Sequence["Sensed"], *, check: bool = True) -> list[Run]:
-        predictor, known = self.predictor, self._known
+        known = self._known
         flagged = "flag_out_of_distribution" in sensed[0].wanted
         rows = [each.run for each in sensed]
-        trained = [trained_on(known[id(job.scene)][0]) for job in jobs]
-        reads = predictor.read(rows, outside=flagged, known=trained) if predictor else [None] * len(rows)
+        twins = [known[id(job.scene)][0] for job in jobs]
+        reads: list[Read | None] = [None] * len(rows)
+        for predictor in {
+            id(own.magnetometer): own.magnetometer for own in twins if own.magnetometer
+        }.values():
+            those = [n for n, own in enumerate(twins) if own.magnetometer is predictor]
+            options: Any = {"outside": flagged, "known": [trained_on(twins[n]) for n in those]}
+            for n, made in zip(those, predictor.read([rows[n] for n in those], **options), strict=True):
+                reads[n] = made
         runs = []
         for job, each, read in zip(jobs, sensed, reads, strict=True):
             own, config = known[id(job.scene)]
@@ -190,17 +260,17 @@ class _Finish:
                 (read.disturbance_nt, read.sd_nt) if read else None, model_error_of(own, job.seed)
             )
             if check:
-                self.check(run)
-            options: Any = {"duration_s": self.duration_s, "config_sha256": config}
+                self.check(job, run)
+            options = {"duration_s": self.duration_s, "config_sha256": config}
             run = stated(own, run, read, add=False)
             runs.append(finished(own, run, path_metadata(job.path), read, seed=job.seed, **options))
         return runs
 
-    def check(self, run: Run) -> None:
+    def check(self, job: "Job", run: Run) -> None:
         """Refuse a run that was driven off the map."""
         from magtwin.sim.exact import check_read
 
-        check_read(run, self.field)
+        check_read(run, self._known[id(job.scene)][0].field)
 
     def identity(self, job: "Job") -> str:
         """What tells a run of a job from others, but for what all runs of the sweep have in common."""
@@ -216,32 +286,41 @@ class _Finish:
 
 
 def _twins(
-    twin: Twin,
+    bases: Sequence[Twin],
     robots: RobotSpec | Twin | Iterable[RobotSpec | Twin] | None,
     sessions: int | Literal["survey"] | None,
     seeds: Sequence[int],
     seed: int,
     model_error: bool,
 ) -> list[Twin]:
-    """The twin of each run, in its session; arguments as for `sweep`."""
-    count = len(seeds)
+    """The twin of each run, in its session, from the opened twin of each; arguments as for `sweep`."""
+    count, made = len(seeds), dict[Any, Twin]()
+
+    def once(key: Any, make: Callable[[], Twin]) -> Twin:
+        if key not in made:
+            made[key] = make()
+        return made[key]
+
     if robots is not None:
         given = _each("robots", robots, count)
-        own = {id(robot): _with_robot(twin, robot, model_error) for robot in given}
-        return [own[id(robot)] for robot in given]
+        return [
+            once((id(base), id(robot)), partial(_with_robot, base, robot, model_error))
+            for base, robot in zip(bases, given, strict=True)
+        ]
     if sessions is None:
-        drawn = {number: in_session(twin, seed=number) for number in set(seeds)}
-        return [drawn[number] for number in seeds]
+        pairs = zip(bases, seeds, strict=True)
+        return [once((id(base), k), partial(in_session, base, seed=k)) for base, k in pairs]
     if sessions == "survey":
-        return [in_session(twin, "survey")] * count
+        return [once(id(base), partial(in_session, base, "survey")) for base in bases]
     if not isinstance(sessions, int | np.integer) or isinstance(sessions, bool) or sessions < 1:
         raise InputError(f'sessions must be a whole number from 1 up, or "survey", got {sessions!r}')
     most = min(int(sessions), count)
     if most < sessions:
         text = f"{sessions} sessions of {count} run{'s' if count > 1 else ''}: only {most} can be driven"
         warnings.warn(text, RepairWarning, stacklevel=3)
-    numbered = [in_session(twin, k, seed=seed) for k in range(most)]
-    return [numbered[k * most // count] for k in range(count)]
+    numbers = [k * most // count for k in range(count)]
+    pairs = zip(bases, numbers, strict=True)
+    return [once((id(base), k), partial(in_session, base, k, seed=seed)) for base, k in pairs]
 
 
 def _with_robot(twin: Twin, robot: RobotSpec | Twin, model_error: bool) -> Twin:
@@ -258,12 +337,13 @@ def _with_robot(twin: Twin, robot: RobotSpec | Twin, model_error: bool) -> Twin:
     return dataclasses.replace(twin, scene=dataclasses.replace(twin.scene, robot=robot))
 
 
-def _drawn_speeds(twin: Twin, count: int, seed: int) -> list[float]:
+def _drawn_speeds(twins: Sequence[Twin], seed: int) -> list[float]:
     """A speed for each run [m/s]."""
     from magtwin.sim.session import draw_speed
 
     generator = np.random.default_rng((seed, 1)).spawn(2)[1]
-    return [draw_speed(twin.scene.robot.drive, rng) for rng in generator.spawn(count)]
+    each = zip(twins, generator.spawn(len(twins)), strict=True)
+    return [draw_speed(twin.scene.robot.drive, rng) for twin, rng in each]
 
 
 def _each(name: str, values: Any, count: int) -> Sequence[Any]:

@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 
@@ -21,7 +21,11 @@ from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import MagnetometerSpec
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+    from magtwin.learn.models.predictor import Predictor
+    from magtwin.learn.training.result import TrainingResult
     from magtwin.sim.sensors.model_error import ModelError
     from magtwin.usd.scene import OpenedScene
 
@@ -32,6 +36,28 @@ Session = int | Literal["survey"]
 """Number of a session, or the robot as it was when the map was surveyed."""
 
 Metadata = dict[str, str | int | float | bool]
+
+
+class HasScene(Protocol):
+    """What can be made a scene, such as a `magtwin.Room`."""
+
+    @property
+    def scene(self) -> Scene:
+        """The scene."""
+
+
+class UsdStage(Protocol):
+    """An open stage, a `pxr.Usd.Stage`."""
+
+    def GetRootLayer(self) -> Any:  # noqa: N802
+        """Its root layer."""
+
+
+Place = Scene | HasScene | UsdStage | str | FilePath
+"""A scene: in memory, as a room, as a stage of pxr's, or as the file of a stage."""
+
+Network: TypeAlias = "str | FilePath | Predictor | TrainingResult | None"
+"""Weights of a neural magnetometer: a file, a predictor, or what `magtwin.train` gives. None: the scene's."""
 
 
 OF_SCENE = "of the scene"
@@ -76,6 +102,10 @@ class Twin(Summarized):
     stage: object = dataclasses.field(default=None, repr=False, compare=False)
     """Keeps the temporary stage of a `Scene` alive. None if `scene_file` is a user's file."""
 
+    def plot(self) -> "Figure":
+        """Draw the room from above, over the map; see `magtwin.plot`."""
+        return importlib.import_module("magtwin").plot(self)  # type: ignore[no-any-return]
+
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "opened": None}  # an open stage stays in its process
 
@@ -103,8 +133,8 @@ class Twin(Summarized):
 
 
 def opened(
-    twin: Twin | Scene | str | FilePath,
-    network: str | FilePath | None,
+    twin: Twin | Place,
+    network: Network,
     magnetometer: Kind | None,
     model_error: bool,
     function: str,

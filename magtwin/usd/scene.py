@@ -2,8 +2,10 @@
 
 import math
 import os
+import re
 from dataclasses import dataclass, replace
 from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -53,6 +55,7 @@ from magtwin.usd.schema import (
     prims_with,
     require_api,
 )
+from magtwin.usd.schema.versions import check_schema
 from magtwin.usd.sensors import MAP_CHECKSUM, MAP_RELATIONSHIP, read_path
 from magtwin.usd.trial import folders_of
 from magtwin.usd.units import check_units
@@ -122,9 +125,25 @@ class OpenedScene:
         return replace(self, stage=stage, scene=scene)
 
 
+def saved_as(stage: Usd.Stage) -> Path | None:
+    """The file that a stage in memory is equal to; None if it has changes that are not saved."""
+    root = stage.GetRootLayer()
+    dirty = any(layer.dirty for layer in stage.GetUsedLayers() if layer != stage.GetSessionLayer())
+    return None if dirty or not root.realPath else Path(root.realPath)
+
+
+def _live(stage: Usd.Stage) -> tuple[Path, Usd.Stage]:
+    """A stage of one's own with the layers of another, and a name for it."""
+    root = stage.GetRootLayer()
+    own = Usd.Stage.Open(root, Sdf.Layer.CreateAnonymous())
+    check_schema(own, root.identifier)
+    stem = Path(root.GetDisplayName()).stem
+    return Path(root.realPath or f"{stem if re.match(r'[A-Za-z0-9]', stem) else 'stage'}.usda"), own
+
+
 @translates
 def open_scene(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Usd.Stage,
     *,
     lab: str = "",
     map_layer: str | os.PathLike[str] | None = None,
@@ -135,7 +154,8 @@ def open_scene(
     All places are in the axes of the lab, wherever it stands on the stage (`magtwin.usd.placement`).
 
     Args:
-        path: Root layer. A start's yaw comes from a quaternion: its last bits may not be those authored.
+        path: Root layer, or a stage that is open in this process, with its changes that are not saved. A
+            start's yaw comes from a quaternion: its last bits may not be those authored.
         lab: Path of the lab's root on a stage of several labs. Default: the only lab.
         map_layer: Map that replaces the stage's.
         check_network: Whether the weights that the magnetometer names must exist.
@@ -144,13 +164,17 @@ def open_scene(
         InputError: A file is missing; the stage has no lab, robot or map, or a lab that is tilted or scaled;
             a value is out of range; or the map is not that of the scene. The text names the prim.
     """
-    path = Path(path)
-    if path.suffix.lower() == ".usdz":
-        raise InputError(
-            f"{path}: files inside a package cannot be read; unpack it with `magtwin export "
-            f"{quote(str(path))} --out DIR` and give the layer in DIR"
-        )
-    stage = open_stage(path)
+    live = isinstance(path, Usd.Stage)
+    if isinstance(path, Usd.Stage):
+        path, stage = _live(path)
+    else:
+        path = Path(path)
+        if path.suffix.lower() == ".usdz":
+            raise InputError(
+                f"{path}: files inside a package cannot be read; unpack it with `magtwin export "
+                f"{quote(str(path))} --out DIR` and give the layer in DIR"
+            )
+        stage = open_stage(path)
     where = lab_on(stage, lab)
     several, pose = len(labs_on(stage)) > 1, pose_of(where)
     check_units(stage)
@@ -193,7 +217,7 @@ def open_scene(
     if scene.map_layer != path.resolve():  # a flattened stage is its own map, and has no checksum
         check_map(scene, f"{place(magnetometers[0])}: ")
     made = anomaly_map.made_from
-    return OpenedScene(
+    opened = OpenedScene(
         path,
         stage,
         scene,
@@ -203,10 +227,18 @@ def open_scene(
         changes=() if made is None else tuple(changes_since(made, scene)),
         notes=tuple(notes),
     )
+    if live:  # the file, if there is one, has other content
+        texts = sorted(layer.ExportToString() for layer in stage.GetUsedLayers() if not layer.anonymous)
+        texts.append(stage.GetRootLayer().ExportToString())
+        opened.__dict__["sha256"] = sha256("\n".join(texts).encode()).hexdigest()
+    return opened
 
 
-def read_scene(path: str | os.PathLike[str], **options: Any) -> Scene:
-    """The scene of a stage; arguments and errors as for `open_scene`."""
+def read_scene(path: str | os.PathLike[str] | Usd.Stage, **options: Any) -> Scene:
+    """The scene of a stage: of its file, or of a `pxr.Usd.Stage` with its changes that are not saved.
+
+    Arguments and errors are those of `open_scene`.
+    """
     return open_scene(path, **options).scene
 
 

@@ -338,7 +338,7 @@ def test_a_toml_of_several_robots_gives_each_its_name_start_path_and_network(own
         ('"there.csv"', '"their.csv"', r"'bob' path: .*their\.csv: no such path file; did you"),
         ("start = [0, -1, 0]", "start = [0, -1]", r"start must be a list of 3"),
         ("start = [0, -1, 0]", "strat = [0, -1, 0]", r"unknown key 'strat'; did you mean 'start'"),
-        ("start = [0, -1, 0]", "footprint_radius_m = 1", r"'cleo' footprint_radius_m goes with urdf"),
+        ("start = [0, -1, 0]", "conversion = {}", r"'cleo' conversion goes with urdf"),
     ],
 )
 def test_a_toml_of_several_robots_that_do_not_fit_is_refused(own_parts, tmp_path, old, new, said):

@@ -22,7 +22,7 @@ import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -232,6 +232,10 @@ class Fit:
     None for a kind that is fitted once."""
 
 
+OWN_MODULE = "module"
+"""Kind of a predictor around a torch module of the user's own."""
+
+
 class PredictorKind(Protocol):
     """How predictors of one kind are fitted and loaded."""
 
@@ -267,16 +271,27 @@ PREDICTORS: Registry[PredictorKind] = Registry(
         "linear": "magtwin.learn.training.kinds:Linears",
         "hybrid": "magtwin.learn.training.kinds:Hybrids",
         "mixed": "magtwin.learn.mixed.fit_mixed:Mixeds",
+        OWN_MODULE: "magtwin.learn.training.own:Modules",
     },
 )
 """Kinds of predictors by name."""
 
+NETWORKS: Registry[Any] = Registry("network of your own", "networks")
+"""Classes of own torch modules, or functions that make one, by the name that a weights file has of them."""
 
-def load_predictor(path: str | os.PathLike[str]) -> Predictor:
+
+def load_predictor(path: str | os.PathLike[str], *, module: Any = None) -> Predictor:
     """Load a predictor of any kind: magtwin's safetensors, or a released `.pth`.
 
+    A file of your own torch module holds its numbers and the name of its class, and no code. Its class must
+    be given, have been trained in this process, or be registered (`magtwin.extend.network`).
+
+    Args:
+        path: The weights.
+        module: Class or instance of your own `torch.nn.Module` that the weights are of. Default: by its name.
+
     Raises:
-        InputError: Neither of the two, damaged, or its parts do not fit each other.
+        InputError: Neither of the two, damaged, its parts do not fit each other, or an own module is unknown.
     """
     if is_checkpoint(path):
         from magtwin.learn.models.network import net_of_checkpoint
@@ -287,7 +302,9 @@ def load_predictor(path: str | os.PathLike[str]) -> Predictor:
         kind = PREDICTORS[weights.kind]
     except InputError as error:
         raise InputError(f"{path}: {error}; update magtwin, or install the package of this kind") from error
-    predictor = kind.load(weights)
+    if module is not None and weights.kind != OWN_MODULE:
+        raise InputError(f"{path}: holds a {weights.kind}, no module of your own; leave `module` out")
+    predictor = kind.load(replace(weights, module=module))
     predictor.residual_sd_nt, predictor.metadata = weights.residual_sd_nt, dict(weights.about["facts"])
     predictor.wide = weights.wide
     return predictor

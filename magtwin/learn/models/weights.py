@@ -54,6 +54,9 @@ class Weights:
     wide: Spread | None = None
     """Spread of errors on robots that it was not trained on; None if it was never learned."""
 
+    module: Any = None
+    """The user's own torch module, a class or an instance, if one was given."""
+
     @property
     def features(self) -> tuple[str, ...]:
         """Names of the inputs."""

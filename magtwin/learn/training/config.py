@@ -10,13 +10,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
-from magtwin.errors import InputError, find
+from magtwin.errors import InputError, find, hint
 from magtwin.files.kinds import expected
-from magtwin.files.settings import from_table, read_toml
+from magtwin.files.settings import from_table, read_toml, value_of
 from magtwin.learn.data.features import feature_names
 from magtwin.learn.data.split import By
 from magtwin.learn.models.linear import Weighting
-from magtwin.learn.models.predictor import PREDICTORS
+from magtwin.learn.models.predictor import OWN_MODULE, PREDICTORS
 
 Device = Literal["cpu", "cuda", "auto"]
 
@@ -42,8 +42,8 @@ COMMON = ("model", "seed", "split", "hold_out", "init", "licence")  # Options th
 
 
 def models() -> list[str]:
-    """Names of all models, those of installed packages included."""
-    return [PAPER, *(kind for kind in PREDICTORS if kind != "mlp")]
+    """Names of all models, those of installed packages included; not that of own modules, which are given."""
+    return [PAPER, *(kind for kind in PREDICTORS if kind not in ("mlp", OWN_MODULE))]
 
 
 def options_of(model: str) -> dict[str, Any]:
@@ -52,7 +52,8 @@ def options_of(model: str) -> dict[str, Any]:
     Raises:
         InputError: No such model.
     """
-    find("model", model, dict.fromkeys(models()))
+    if model != OWN_MODULE:
+        find("model", model, dict.fromkeys(models()))
     return dict(PREDICTORS["mlp" if model == PAPER else model].options)
 
 
@@ -167,7 +168,18 @@ class TrainConfig:
         return {name: getattr(self, name) for name in options_of(self.model)}
 
     def with_options(self, **options: Any) -> "TrainConfig":
-        """The configuration with other options. Another `model` drops the options that it does not read."""
+        """The configuration with other options. Another `model` drops the options that it does not read.
+
+        Raises:
+            InputError: An option is unknown, has the wrong type, or is not read by the model.
+        """
+        names = [field.name for field in fields(self)]
+        for name, value in options.items():
+            if name not in names:
+                raise InputError(f"{name} is no option of a training; {hint(name, names)}", parameter=name)
+            if name == "features" and isinstance(value, list | tuple):
+                value = ",".join(map(str, value))
+            options[name] = value_of(TrainConfig, name, value)
         keep = {field.name: getattr(self, field.name) for field in fields(self)}
         if options.get("model", self.model) != self.model:
             default, known = options_of(self.model), options_of(options["model"])

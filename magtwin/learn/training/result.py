@@ -144,7 +144,7 @@ def model_card(result: TrainingResult, name: str, checksum: str) -> str:
         _wrapped(f"**{result.verdict()}**"),
         _wrapped(_how(result)),
         _table(result),
-        _wrapped(_spread(predictor.kind)),
+        _wrapped(_spread(predictor)),
         "## To reproduce it",
         _reproduce(result, name),
     ]
@@ -228,8 +228,9 @@ def _table(result: TrainingResult) -> str:
     return "\n".join(lines)
 
 
-def _spread(kind: str) -> str:
+def _spread(predictor: Predictor) -> str:
     """Where the width of the intervals comes from."""
+    constant = predictor.kind == "mlp" or getattr(predictor, "sd_factor", 1.0) is None
     own = (
         "Each row has its own standard deviation, scaled so that 90 % intervals hold 90 % on recordings left "
         "out of the fit, none of them in the test."
@@ -238,7 +239,7 @@ def _spread(kind: str) -> str:
         "The intervals in this table come from the RMSE on validation, `b_sd_nt` of a Run from the test's."
     )
     return (
-        f"{alike if kind == 'mlp' else own} The file keeps the RMSE on the test as `residual_sd_nt`. Rows of "
+        f"{alike if constant else own} The file keeps the RMSE on the test as `residual_sd_nt`. Rows of "
         "a recording are correlated: judge these errors by the number of recordings, not of rows."
     )
 

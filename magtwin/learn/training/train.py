@@ -23,7 +23,15 @@ from magtwin.learn.data.residuals import HeldOut, held_out_errors, residuals
 from magtwin.learn.data.split import PARTS, Part, Split
 from magtwin.learn.data.split import split as split_recordings
 from magtwin.learn.models.linear import fit_linear
-from magtwin.learn.models.predictor import PREDICTORS, Epoch, Fit, FitTask, Predictor, load_predictor
+from magtwin.learn.models.predictor import (
+    OWN_MODULE,
+    PREDICTORS,
+    Epoch,
+    Fit,
+    FitTask,
+    Predictor,
+    load_predictor,
+)
 from magtwin.learn.models.weights import MetadataValue
 from magtwin.learn.training.config import TrainConfig
 from magtwin.learn.training.result import PartErrors, TrainingResult, model_card
@@ -61,19 +69,30 @@ def train(
         force: Replace existing files.
         progress: Called after each epoch.
         advance: Called after each step with the rows done and the rows of all epochs.
-        **options: Fields of `TrainConfig`, such as model="hybrid" or seed=3. They override `config`.
+        **options: Fields of `TrainConfig`, such as model="hybrid" or seed=3. They override `config`. `model`
+            may also be a `torch.nn.Module` of your own: its class, which is called with the number of
+            features, or an instance. It gets standardised features, shape (N, F), and gives the standardised
+            disturbance, shape (N,) or (N, 1), or (N, 2) with the logarithm of its standard deviation; see
+            `magtwin.learn.training.own`.
 
     Raises:
         InputError: The recordings do not suffice, the data set lacks a column of a feature, an option does
             not fit the model, or a file exists.
     """
+    module = options.get("model")
+    if isinstance(module, str | None):
+        module = None
+        if options.get("model", config and config.model) == OWN_MODULE:
+            raise InputError("model 'module' is a torch module of your own: give its class, `model=MyModule`")
+    else:
+        options["model"] = OWN_MODULE
     config = (config or TrainConfig()).with_options(**options)
     for path in () if out is None else (Path(out), Path(out).with_suffix(".md")):
         check_free(path, force=force)
     dataset = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
     deals, draws = np.random.default_rng(config.seed).spawn(2)
     parts = split_recordings(dataset.recordings, config.split, hold_out=config.hold_out, rng=deals)
-    result = fit(config, dataset, parts, rng=draws, progress=progress, advance=advance)
+    result = fit(config, dataset, parts, rng=draws, module=module, progress=progress, advance=advance)
     if out is not None:
         out = Path(out)
         with (
@@ -92,18 +111,20 @@ def fit(
     split: Split,
     *,
     rng: np.random.Generator,
+    module: Any = None,
     progress: Callable[[Epoch], None] | None = None,
     advance: Callable[[int, int], None] | None = None,
 ) -> TrainingResult:
     """Train on one part of a data set, stop and calibrate by another, judge by the third.
 
     Of `config`, `seed`, `split` and `hold_out` are not read; `rng` draws initial weights, order and dropout.
+    `module` is the user's own torch module, if the kind is that.
     """
     threads, before = config.threads or 1, torch.get_num_threads()
     with threadpool_limits(threads):  # the products of numpy and scipy
         torch.set_num_threads(threads)
         try:
-            return _fit(config, dataset, split, rng, progress, advance)
+            return _fit(config, dataset, split, rng, module, progress, advance)
         finally:
             torch.set_num_threads(before)
 
@@ -113,6 +134,7 @@ def _fit(
     dataset: Dataset,
     split: Split,
     rng: np.random.Generator,
+    module: Any,
     progress: Callable[[Epoch], None] | None,
     advance: Callable[[int, int], None] | None,
 ) -> TrainingResult:
@@ -132,7 +154,7 @@ def _fit(
         validation=rows["validation"],
         train_groups=groups["train"],
         validation_groups=groups["validation"],
-        options=config.options,
+        options=config.options if module is None else {**config.options, "module": module},
         rng=rng,
         recordings=recordings,
         init=init,

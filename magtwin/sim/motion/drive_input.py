@@ -39,20 +39,19 @@ def drive_input(path: Any, room: Room | None = None, *, fit: bool = False) -> Dr
     )
 
 
-def drive_inputs(paths: Any, room: Room | None = None) -> DriveInput | list[DriveInput]:
-    """One input for all runs, or a list with one for each; a repeated name or file is read once."""
+def each_input(paths: Any) -> list[Any]:
+    """What several runs drive, as for `drive_input`: one for all of them, or several.
+
+    Raises:
+        InputError: There is none.
+    """
     single = isinstance(paths, str | FilePath | Path | Commands | Run)
     if single or not hasattr(paths, "__iter__"):
-        return drive_input(paths, room)
+        return [paths]
     listed = list(paths)
-    if _are_points(listed):
-        return drive_input(listed, room)
-    known: dict[Any, DriveInput] = {}
-    keys = [path if isinstance(path, str | FilePath) else id(path) for path in listed]
-    for key, path in zip(keys, listed, strict=True):
-        if key not in known:
-            known[key] = drive_input(path, room)
-    return [known[key] for key in keys]
+    if not listed:
+        raise InputError("paths must name one path at least", parameter="paths")
+    return [listed] if _are_points(listed) else listed
 
 
 def path_metadata(path: DriveInput) -> dict[str, str | int | float | bool]:

@@ -51,6 +51,9 @@ class Job:
     speed: float
     """Forward speed on straight parts of the path [m/s]."""
 
+    conditions: Conditions
+    """Map, obstacles and options."""
+
 
 class Finish(Protocol):
     """From jobs and their sensed runs to whole runs: where a network predicts, for all rows at once."""
@@ -58,7 +61,7 @@ class Finish(Protocol):
     def __call__(self, jobs: Sequence[Job], sensed: Sequence[Sensed], *, check: bool = True) -> list[Run]:
         """Whole runs; `check` is False for blocks of a run."""
 
-    def check(self, run: Run) -> None:
+    def check(self, job: Job, run: Run) -> None:
         """Refuse a run that is not to be kept."""
 
 
@@ -82,7 +85,6 @@ class Runs(Summarized, Sequence[Run]):
     def __init__(
         self,
         jobs: Sequence[Job],
-        conditions: Conditions,
         finish: Finish,
         *,
         columns: Iterable[str] | None = None,
@@ -93,7 +95,7 @@ class Runs(Summarized, Sequence[Run]):
             raise InputError("no runs are asked for; give a seed for each")
         if not isinstance(block, int) or block < 1:
             raise InputError(f"block must be a whole number from 1 up, got {block!r}")
-        self._jobs, self._conditions, self._finish, self._block = jobs, conditions, finish, block
+        self._jobs, self._finish, self._block = jobs, finish, block
         self._columns = frozenset(COLUMNS if columns is None else {"t", *columns})
         for name in sorted(self._columns):
             find("column", name, COLUMNS)
@@ -104,7 +106,7 @@ class Runs(Summarized, Sequence[Run]):
             with labelled(self._label(i)):
                 key = (id(job.scene), id(job.path))
                 if key not in checked:
-                    check_run(job.scene, job.path, conditions)
+                    check_run(job.scene, job.path, job.conditions)
                     checked.add(key)
                 if planned := self._course(job).loop:
                     self._steps += planned.least_steps
@@ -143,7 +145,7 @@ class Runs(Summarized, Sequence[Run]):
         told = getattr(self._finish, "identity", None)
         if told is None:
             return None
-        common, total = self._conditions, hashlib.sha256()
+        common, total = self._jobs[0].conditions, hashlib.sha256()
         options = (common.duration_s, common.rate_hz, common.controller, common.lidar, common.outside)
         total.update(repr((options, sorted(self._columns))).encode())
         paths = {id(job.path): _content(job.path) for job in self._jobs}
@@ -192,23 +194,27 @@ class Runs(Summarized, Sequence[Run]):
             return self._finish([job], [block], check=False)[0]
 
         run = read_all(sensed.sensing, sensed.motion, sensed.metadata, read)
-        self._finish.check(run)
+        self._finish.check(job, run)
         return run
 
     def _sensed(self, numbers: Sequence[int]) -> list[Any]:
         """Drive some runs, and sense those that are not long."""
-        common = self._conditions
         jobs = [self._jobs[i] for i in numbers]
         trips = [
             Trip(job.scene, self._course(job), streams(np.random.default_rng(job.seed)), self._label(i))
             for i, job in zip(numbers, jobs, strict=True)
         ]
-        motions = drive(trips, common)
+        together: dict[int, list[int]] = {}  # those in the same room are driven at once
+        for n, job in enumerate(jobs):
+            together.setdefault(id(job.conditions), []).append(n)
+        motions: dict[int, Travel] = {}
+        for those in together.values():
+            motions |= zip(those, drive([trips[n] for n in those], jobs[those[0]].conditions), strict=True)
         sensed: list[Sensed | _Driven] = []
-        for trip in trips:
+        for n, (job, trip) in enumerate(zip(jobs, trips, strict=True)):
             with labelled(trip.label):
-                motion, metadata = motions.pop(0), trip.course.metadata
-                sensing = Sensing(trip.scene, trip.draws, common, wanted=self._columns)
+                motion, metadata = motions.pop(n), trip.course.metadata
+                sensing = Sensing(trip.scene, trip.draws, job.conditions, wanted=self._columns)
                 count, _ = readings(sensing, motion, metadata)
                 long = sensing.rows_at_once(count) < count
                 make = _Driven if long else sense_all
@@ -227,14 +233,14 @@ class Runs(Summarized, Sequence[Run]):
             odometry_noise_std=0.0,
         )
         if isinstance(job.path, Run):
-            return course_of(job.scene, job.path, job.speed, self._conditions)
-        key = (job.path, job.speed, alike, robot.footprint_radius_m, job.scene.start)
+            return course_of(job.scene, job.path, job.speed, job.conditions)
+        key = (job.path, job.speed, alike, robot.footprint_radius_m, job.scene.start, job.conditions)
         if key in self._planned:
             return self._planned[key]
         if self._kept > PLANNED:
             self._planned.clear()
             self._kept = 0
-        course = course_of(job.scene, job.path, job.speed, self._conditions)
+        course = course_of(job.scene, job.path, job.speed, job.conditions)
         self._kept += course.loop.guide.table.nbytes if course.loop else 0
         self._planned[key] = course
         return course

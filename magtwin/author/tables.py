@@ -1,0 +1,131 @@
+"""Tables: a scene as the tables of its TOML, and their text. `magtwin.author.scene_file` reads them."""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from magtwin.author.scene_file import PARTS
+from magtwin.files.file import shipped
+from magtwin.spec.base import KEY
+from magtwin.spec.plant import PlantSpec
+from magtwin.spec.robot import PlacedRobot
+from magtwin.spec.scene import Scene
+from magtwin.usd.robot import load_robot
+
+Table = dict[str, Any]
+
+
+def toml_text(table: Mapping[str, Any]) -> str:
+    """Tables as the text of a TOML that `magtwin.files.settings.read_toml` reads back, number for number."""
+    lines = list[str]()
+
+    def write(table: Mapping[str, Any], section: str) -> None:
+        below = []
+        for key, value in table.items():
+            if isinstance(value, Mapping) or (isinstance(value, list) and value and _are_tables(value)):
+                below.append((f"{section}.{_key(key)}" if section else _key(key), value))
+            else:
+                lines.append(f"{_key(key)} = {_text(value)}")
+        for name, value in below:
+            for each in [value] if isinstance(value, Mapping) else value:
+                lines.extend(("", f"[{name}]" if isinstance(value, Mapping) else f"[[{name}]]"))
+                write(each, name)
+
+    write(table, "")
+    return "\n".join(lines).strip() + "\n"
+
+
+def _are_tables(values: Sequence[Any]) -> bool:
+    return all(isinstance(value, Mapping) for value in values)
+
+
+def _key(key: str) -> str:
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _text(key)
+
+
+def _text(value: Any) -> str:
+    """A value as TOML; texts have JSON's escapes, of which TOML lacks none that is used."""
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_text, value))}]"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value)
+
+
+def table_of_scene(scene: Scene) -> Table:
+    """A scene as the tables of a TOML: `scene_from_toml` makes the same scene of them."""
+    table: Table = {"name": scene.name, "map": str(scene.map_layer.absolute())}
+    alone = not scene.others and load_robot(scene.robot.asset).name == scene.robot.name
+    robots = [table_of_robot(placed) for placed in scene.robots]
+    if alone:
+        table["start"] = robots[0].pop("start")
+        del robots[0]["name"]
+    lab = table_of(scene.lab)
+    if "floor" not in lab:
+        lab["floor_m"] = list(scene.lab.floor_m)
+    table["lab"] = lab
+    for section, things in (("wall", "walls"), ("door", "doors"), ("window", "windows")):
+        if of_lab := getattr(scene.lab, things, ()):
+            table[section] = [table_of(thing) for thing in of_lab]
+    if scene.earth is not None:
+        table["earth"] = table_of(scene.earth)
+    if scene.sources:
+        table["source"] = [
+            table_of(source, leave={"size_m"} if source.faces else set()) for source in scene.sources
+        ]
+    if scene.furniture:  # magnetization is given, or else it would be drawn
+        pieces = [(piece, table_of(piece)) for piece in scene.furniture]
+        table["furniture"] = [
+            {**given, "magnetization": list(piece.magnetization)} for piece, given in pieces
+        ]
+    return table | {"robot": robots[0] if alone else robots}
+
+
+def table_of(spec: Any, *, leave: "set[str] | frozenset[str]" = frozenset(), like: Any = None) -> Table:
+    """The fields of a spec that differ from their defaults, or from those of another spec.
+
+    Args:
+        spec: The spec.
+        leave: Fields to leave out.
+        like: Spec of the same class to differ from.
+    """
+    table: Table = {}
+    for f in fields(spec):
+        key, value = f.metadata.get(KEY, f.name), getattr(spec, f.name)
+        default = f.default if f.default_factory is MISSING else f.default_factory()
+        if key is None or f.name in leave or value == (default if like is None else getattr(like, f.name)):
+            continue
+        table[key] = table_of(value) if is_dataclass(value) else _value(value)
+    return table
+
+
+def _value(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_value(entry) for entry in value]
+    return str(value.absolute()) if isinstance(value, Path) else value
+
+
+def table_of_robot(placed: PlacedRobot) -> Table:
+    """A robot as its asset, and what differs from it."""
+    robot, asset = placed.robot, load_robot(placed.robot.asset)
+    known = shipped("robots") / robot.asset.stem / robot.asset.name
+    table: Table = {
+        "name": robot.name,
+        "asset": robot.asset.stem if known == robot.asset else str(robot.asset),
+        "start": list(placed.start),
+    }
+    if placed.path:
+        table["path"] = str(placed.path)
+    if robot.footprint_radius_m != asset.footprint_radius_m:
+        table["footprint_radius_m"] = robot.footprint_radius_m
+    for name in PARTS:
+        if given := table_of(getattr(robot, name), like=getattr(asset, name)):
+            table[name] = given
+    if robot.plant != asset.plant:
+        table["plant"] = table_of(robot.plant, like=PlantSpec())
+    return table
