@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.frames import quat_conjugate, quat_multiply, rotate
 from magtwin.io.bags.cdr import NS
-from magtwin.io.bags.frames import LEAVES, Mount, Role, StaticFrames, in_base, mount_of, role_of
 from magtwin.io.bags.topics import LATCHED, SENSOR_DATA, TF_STATIC, Topic
 from magtwin.io.bags.types import layout
+from magtwin.io.recording.frames import LEAVES, Mount, StaticFrames, in_base, mount_of
+from magtwin.io.recording.roles import Role, role_of
 from magtwin.ros.bus import Bus, Message, Subscription
 from magtwin.ros.diagnostics import Level, Problems, Status, status_of
 from magtwin.spec.base import Quat

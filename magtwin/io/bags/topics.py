@@ -79,8 +79,11 @@ class Topic:
     more: Callable[[Columns, NDArray[np.int64], Sender], Fields] = lambda c, stamp, sender: {}
     """Fields of messages beyond the header and the columns of `reads`; also called with the stamps [ns]."""
 
-    reads: Mapping[str, Mapping[str, str | tuple[str, int]]] = field(default_factory=dict)
-    """By message type: the leaf of each column that is read, or a leaf and an index into it."""
+    reads: Mapping[str, Mapping[str, str | tuple[str, int] | tuple[str, ...]]] = field(default_factory=dict)
+    """By message type: the leaf of each column that is read, a leaf and an index, or several leaves."""
+
+    turned: Mapping[str, Callable[[dict[str, Array]], dict[str, Array]]] = field(default_factory=dict)
+    """By message type: the columns in the axes of REP 103, of columns in others."""
 
     def write(self, c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
         """Fields of messages, from the columns of some rows and their stamps [ns]."""
@@ -91,16 +94,22 @@ class Topic:
 
     def leaves(self, kind: str) -> list[str]:
         """Names of the leaves of a message type that are read."""
-        return [leaf if isinstance(leaf, str) else leaf[0] for leaf in self.reads[kind].values()]
+        leaves = [(leaf,) if isinstance(leaf, str) else leaf for leaf in self.reads[kind].values()]
+        return [name for parts in leaves for name in parts if isinstance(name, str)]
 
     def read(self, kind: str, fields: Fields) -> dict[str, NDArray[Any]]:
         """The columns that the fields of messages give."""
         columns = {}
         for name, leaf in self.reads[kind].items():
-            values = fields[leaf] if isinstance(leaf, str) else fields[leaf[0]][:, leaf[1]]
+            if isinstance(leaf, str):
+                values = fields[leaf]
+            elif isinstance(leaf[1], int):
+                values = fields[leaf[0]][:, leaf[1]]
+            else:
+                values = np.stack([fields[str(part)] for part in leaf], axis=-1)
             # ROS counts current into the battery, magtwin out of it
             columns[name] = -values.astype(float) if name == "battery_a" else values.astype(float, copy=False)
-        return columns
+        return self.turned[kind](columns) if kind in self.turned else columns
 
 
 def nt_per(sender: Sender) -> float:
@@ -244,11 +253,38 @@ def _pose_at(prefix: str, p: str = "position", q: str = "orientation") -> dict[s
     return {"mocap_p": prefix + p, "mocap_q_xyzw": prefix + q}
 
 
-def _carrier(kind: str, leaves: dict[str, str], **rest: Any) -> Topic:
-    """A topic whose message type holds each of its columns in a leaf."""
-    return Topic(kind=kind, needs=tuple(leaves), carried=True, reads={kind: leaves}, **rest)
+def _carrier(
+    kind: str, leaves: dict[str, str], others: Mapping[str, Any] = MappingProxyType({}), **rest: Any
+) -> Topic:
+    """A topic whose message type holds each of its columns in a leaf; `others` are `reads` of other types."""
+    return Topic(kind=kind, needs=tuple(leaves), carried=True, reads={kind: leaves, **others}, **rest)
 
 
+def _of_frd(columns: dict[str, Array]) -> dict[str, Array]:
+    """Vectors in forward-right-down axes as forward-left-up."""
+    return {name: values * (1.0, -1.0, -1.0) for name, values in columns.items()}
+
+
+def _of_px4_imu(columns: dict[str, Array]) -> dict[str, Array]:
+    return _of_frd(columns) | {"imu_q_xyzw": np.zeros((len(columns["imu_w"]), 4))}
+
+
+def _of_ned(columns: dict[str, Array], name: str = "odom") -> dict[str, Array]:
+    """Odometry of PX4, from north-east-down and forward-right-down to ENU and forward-left-up.
+
+    Its quaternion is w first, and its velocity is in north-east-down.
+    """
+    q_ned_frd = columns[f"{name}_q_xyzw"][:, [1, 2, 3, 0]]
+    enu = np.array([1.0, 1.0, 0.0, 0.0]) / np.sqrt(2.0)  # half a turn about x + y
+    q = quat_multiply(quat_multiply(enu, q_ned_frd), np.array([1.0, 0.0, 0.0, 0.0]))
+    p = columns[f"{name}_p"][:, [1, 0, 2]] * (1.0, 1.0, -1.0)
+    turned = _of_frd({"odom_w": columns["odom_w"]}) if "odom_w" in columns else {}
+    if "odom_v" in columns:
+        turned |= _of_frd({"odom_v": rotate(quat_conjugate(q_ned_frd), columns["odom_v"])})
+    return {f"{name}_p": p, f"{name}_q_xyzw": q} | turned
+
+
+_PX4 = "px4_msgs/msg/"
 _FIELD = "sensor_msgs/msg/MagneticField"
 
 POSE = Topic(
@@ -263,7 +299,9 @@ POSE = Topic(
         "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_at("pose.pose."),
         "geometry_msgs/msg/TransformStamped": _pose_at("transform.", "translation", "rotation"),
         "nav_msgs/msg/Odometry": _pose_at("pose.pose."),
+        _PX4 + "VehicleOdometry": {"mocap_p": "position", "mocap_q_xyzw": "q"},
     },
+    turned={_PX4 + "VehicleOdometry": lambda c: _of_ned(c, "mocap")},
 )
 ODOMETRY = _carrier(
     "nav_msgs/msg/Odometry",
@@ -273,6 +311,15 @@ ODOMETRY = _carrier(
         "odom_v": "twist.twist.linear",
         "odom_w": "twist.twist.angular",
     },
+    {
+        _PX4 + "VehicleOdometry": {
+            "odom_p": "position",
+            "odom_q_xyzw": "q",
+            "odom_v": "velocity",
+            "odom_w": "angular_velocity",
+        }
+    },
+    turned={_PX4 + "VehicleOdometry": _of_ned},
     name="/robot/odom",
     frame="odom_frame",
     more=_odometry,
@@ -280,6 +327,8 @@ ODOMETRY = _carrier(
 IMU = _carrier(
     "sensor_msgs/msg/Imu",
     {"imu_q_xyzw": "orientation", "imu_w": "angular_velocity", "imu_a": "linear_acceleration"},
+    {_PX4 + "SensorCombined": {"imu_w": "gyro_rad", "imu_a": "accelerometer_m_s2"}},
+    turned={_PX4 + "SensorCombined": _of_px4_imu},
     name="/robot/imu",
     frame="imu_frame",
     more=_imu,
@@ -303,9 +352,13 @@ MAGNITUDE = Topic(
     reads={
         _FIELD: {"magnetic_field": "magnetic_field"},
         "geometry_msgs/msg/Vector3Stamped": {"magnetic_field": "vector"},
+        "geometry_msgs/msg/Vector3": {"magnetic_field": ("x", "y", "z")},
         "std_msgs/msg/Float64": {"magnetic_field": "data"},
         "std_msgs/msg/Float32": {"magnetic_field": "data"},
+        _PX4 + "VehicleMagnetometer": {"magnetic_field": "magnetometer_ga"},
+        _PX4 + "SensorMag": {"magnetic_field": ("x", "y", "z")},
     },
+    turned=dict.fromkeys((_PX4 + "VehicleMagnetometer", _PX4 + "SensorMag"), _of_frd),
 )
 VECTOR = Topic(
     name="/robot/qtfm/field",
