@@ -462,7 +462,8 @@ def test_a_chunk_that_says_it_is_a_thousand_times_its_size_is_refused_unread(bag
     content[chunk : chunk + 8] = (1 << 29).to_bytes(8, "little")
     (tmp_path / "run.mcap").write_bytes(content)
     with pytest.warns(RepairWarning, match="1 of 3 chunks or records are damaged and are left out"):
-        assert read_bag(tmp_path / "run.mcap").rows < read_bag(bags / "run.mcap").rows
+        run = read_bag(tmp_path / "run.mcap")
+    assert 0 < run.rows < read_bag(bags / "run.mcap").rows
 
 
 def test_an_own_bag_gives_the_readings_of_its_run_or_those_of_the_topics_that_are_named(bags, made):

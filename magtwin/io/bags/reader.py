@@ -66,7 +66,8 @@ def read_bag(
     check_factor(unit, scale)
     check_roles(topics or ())
     with Bag(Path(path)) as bag, np.errstate(over="ignore", invalid="ignore"):
-        if READING.name in bag.kinds and NAMES.name in bag.kinds and not topics:
+        own = READING.name in bag.kinds and NAMES.name in bag.kinds and not topics
+        if own and not (bag.damaged and not len(bag.messages([NAMES.name])[NAMES.name])):
             if unit or scale is not None:
                 raise InputError(
                     f"{bag.path}: magtwin wrote it and it holds its unit; drop {unit or scale!r}"

@@ -96,7 +96,7 @@ class StaticFrames:
             self.parents[plain(child)] = plain(parent), np.asarray(p, float), np.asarray(q_xyzw, float) / size
 
     def describe(self, urdf: str) -> None:
-        """Take the fixed joints of a robot's description, where /tf_static has none; none of a damaged one."""
+        """Take the fixed joints of a description, where /tf_static has none; those of no damaged one."""
         from magtwin.urdf.description.model import origin_numbers
         from magtwin.urdf.source.markup import parse_markup
 
