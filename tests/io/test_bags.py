@@ -456,6 +456,7 @@ def test_an_sqlite_bag_of_too_many_topics_or_of_texts_for_messages_is_refused(tm
         bag.messages(["/m"])
 
 
+@pytest.mark.filterwarnings("ignore:.* joins .*:magtwin.errors.RepairWarning")
 def test_a_chunk_that_says_it_is_a_thousand_times_its_size_is_refused_unread(bags, tmp_path):
     content = bytearray((bags / "run.mcap").read_bytes())
     chunk = content.index(b"zstd") - 4 - 4 - 8  # its size stands before checksum and codec

@@ -192,7 +192,7 @@ TIES = [
     (
         read_bag,
         {"/mag": readings(), "/place": poses(), "/site": SLAM},
-        "pose topics, /place .*, 20 Hz.*/site .*, 5 Hz.*",
+        "pose topics, /place .*/site .*, 5 Hz.*",
     ),
     (read_bag, {**BASE, **TWO}, "odometry topics, /odom1 .*, /odom2 .*--remap /robot/odom:=TOPIC$"),
     (read_readings, {"/mag": readings(), **TWO}, "odometry topics, .*--pose-topic TOPIC$"),
@@ -232,7 +232,8 @@ def test_a_minor_role_of_several_topics_or_of_another_clock_is_left_out_with_a_w
         warnings.simplefilter("always")
         run = read_bag(bag)
     assert not {"imu_w", "battery_v"} & set(run)
-    imus, battery = (str(w.message) for w in told if w.category is RepairWarning)
+    words = [str(warning.message) for warning in told]
+    imus, battery = (text for text in words if " joins " not in text and "by its size" not in text)
     assert "2 IMU topics, /imu/a (sensor_msgs/msg/Imu, 30 Hz), /imu/b" in imus
     assert imus.endswith(f"choose with --remap {IMU}:=TOPIC; none is read")
     assert "battery topic left out: /battery spans 1000000.000..1000003.000 s since" in battery

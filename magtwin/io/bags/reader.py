@@ -66,25 +66,27 @@ def read_bag(
     check_factor(unit, scale)
     check_roles(topics or ())
     with Bag(Path(path)) as bag, np.errstate(over="ignore", invalid="ignore"):
-        own = READING.name in bag.kinds and NAMES.name in bag.kinds and not topics
-        if own and not (bag.damaged and not len(bag.messages([NAMES.name])[NAMES.name])):
+        if READING.name in bag.kinds and NAMES.name in bag.kinds and not topics:
             if unit or scale is not None:
                 raise InputError(
                     f"{bag.path}: magtwin wrote it and it holds its unit; drop {unit or scale!r}"
                 )
-            return _own(bag)
+            if (run := _own(bag)) is not None:
+                return run
         recording = Recording(bag, topics or {}, survey=survey)
         recording.read(unit, scale)
         return recording.run
 
 
-def _own(bag: Bag) -> Run:
-    """The run that magtwin wrote."""
+def _own(bag: Bag) -> Run | None:
+    """The run that magtwin wrote; None if the names of its columns were damaged."""
     _check_kinds(bag, (READING, NAMES))
     carriers = {name for name, topic in TOPICS.items() if topic.carried} & bag.kinds.keys()
     messages = bag.messages((READING.name, NAMES.name, *carriers))
     rows = messages[READING.name]
     texts = decode(layout(NAMES.kind), messages[NAMES.name], ["data"])["data"]
+    if not texts and bag.damaged:
+        return None
     if not texts:
         raise InputError(f"{bag.path}: a recording into which nothing was written yet")
     table = json.loads(texts[0])
