@@ -113,14 +113,14 @@ assets: $(VENV)/.dev  ## Build robots/, maps/, weights/ and scenes/ anew
 	$(BIN)/python scenes/build.py
 
 pictures: $(VENV)/.installed build/blender/.installed  ## Draw the pictures of README and docs again (needs npm and chromium)
-	$(BIN)/magtwin picture scenes/lab/lab.usda --out docs/lab.png --force
-	$(BIN)/magtwin picture robots/turtlebot4/turtlebot4.usda --size 1100x900 --out docs/robot.png --force
-	$(BIN)/magtwin map plot maps/lab/lab.usdc --out docs/map.png --force
+	$(BIN)/magtwin plot scenes/lab/lab.usda --out docs/lab.png --force
+	$(BIN)/magtwin plot robots/turtlebot4/turtlebot4.usda --size 1100x900 --out docs/robot.png --force
+	$(BIN)/magtwin plot maps/lab/lab.usdc --out docs/map.png --force
 	$(BIN)/magtwin run scenes/lab/lab.usda --out build/pictures --force
-	$(BIN)/magtwin picture build/pictures/run.rrd --time-s 35 --size 1600x900 --out docs/recording.png --force
+	$(BIN)/magtwin plot build/pictures/run.rrd --at 35 --size 1600x900 --out docs/recording.png --force
 	$(BIN)/magtwin report build/pictures/run.parquet --out build/pictures/run.html --force
 	chromium --headless=new --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --hide-scrollbars --window-size=1440,860 --virtual-time-budget=8000 --screenshot=$(CURDIR)/docs/page.png "file://$(CURDIR)/build/pictures/run.html#t=45.4"
-	$(BIN)/magtwin film build/pictures/run.parquet --camera 0.4,-1.6,6.1:0.4,-0.2,0 --size 560x350 --pace 10 --fps 8 --out docs/run.gif --force
+	$(BIN)/magtwin plot build/pictures/run.parquet --camera 0.4,-1.6,6.1:0.4,-0.2,0 --size 560x350 --pace 10 --fps 8 --out docs/run.gif --force
 	MAGTWIN_BLENDER=$(CURDIR)/build/blender/bin/python $(BIN)/python docs/looks.py
 
 clean:  ## Remove the environment and what was built

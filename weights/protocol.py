@@ -219,7 +219,7 @@ def widened(
     for k, folder in zip(PLANTS, plants, strict=False):
         do("sweep", stage, "--plant", f"all:{k}", "--out", folder, *drives, "--seed", 10 * k)
     for file, field in zip(weights, maps, strict=True):
-        do("network", "widen", file, "--runs", *plants, "--map", field, "--out", out / file.name)
+        do("model", "widen", file, "--runs", *plants, "--map", field, "--out", out / file.name)
     return [out / file.name for file in weights]
 
 

@@ -5,12 +5,12 @@ import sys
 from importlib import import_module
 
 from magtwin.cli import app as application
+from magtwin.cli.help import FLAGS, front, listing
+from magtwin.cli.words import GROUPS, as_of_today
 
 MODULES = {
     "bench": ("bench",),
-    "calibrate": ("learn.calibrate",),
     "compare": ("runs.report",),
-    "compensate": ("learn.compensate",),
     "completion": ("doctor",),
     "convert": ("runs.file",),
     "dataset": ("learn.dataset",),
@@ -20,13 +20,12 @@ MODULES = {
     "evaluate": ("learn.evaluate",),
     "export": ("scenes.export",),
     "fetch": ("runs.file",),
-    "film": ("runs.picture",),
     "info": ("runs.file",),
     "localize": ("localize",),
     "map": ("maps.fit", "maps.look"),
-    "network": ("learn.network",),
+    "model": ("learn.model", "learn.compensate"),
     "new": ("scenes.scene",),
-    "picture": ("runs.picture",),
+    "plot": ("runs.plot",),
     "report": ("runs.report",),
     "reproduce": ("runs.report",),
     "robot": ("scenes.robot",),
@@ -48,11 +47,20 @@ GARBAGE = 50_000
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the `magtwin` command; `arguments` default to those of the command line."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    arguments = as_of_today(sys.argv[1:] if arguments is None else arguments)
     gc.set_threshold(GARBAGE)
-    name = arguments[0] if arguments else ""
-    load(name if name in MODULES and name != "completion" else None)
-    application.main(arguments)
+    name = arguments[0] if arguments else "-h"
+    group = name.lower() if name.title() in GROUPS and FLAGS & set(arguments) else ""
+    if name in FLAGS:
+        application.main(arguments, tell=front)
+    elif name.startswith("-") or name in MODULES:
+        load(name if name in MODULES and name != "completion" else None)
+        application.main(arguments)
+    elif group or name == "help":
+        load()
+        application.main(arguments, tell=lambda: listing(application.app, group))
+    else:
+        application.main(arguments, tell=lambda: application.refuse_command(arguments))
 
 
 def load(command: str | None = None) -> None:

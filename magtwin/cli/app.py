@@ -11,11 +11,12 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NoReturn
 
 from cyclopts import App, Parameter
 from cyclopts.exceptions import CycloptsError
 
+from magtwin.cli.help import FLAGS, panel_of
 from magtwin.cli.options import Json, Quiet
 from magtwin.cli.progress import watched
 from magtwin.cli.settings import Environment, Settings, is_setting
@@ -29,15 +30,11 @@ app = App(
     help="Author magnetic digital twins of labs and robots in USD, simulate what a robot's magnetometer "
     "reads, fit field maps and train neural magnetometers.",
     version=__version__,
+    version_flags=("--version", "-V"),
     config=[Environment("MAGTWIN_", show=False), Settings("magtwin.toml")],
     default_parameter=Parameter(negative_iterable="", negative_none=""),
-    help_epilogue="Options can also be set in the environment (MAGTWIN_RUN_SEED=1) and in magtwin.toml. "
-    "Exit status: 0 done, 1 an input was refused, 2 wrong usage. Each command also takes --debug, which "
-    "shows the traceback of a refusal, and --allow DIR, which lets stages name files in that folder, beside "
-    "their own and magtwin's; it can be repeated.",
+    help_epilogue="magtwin --help tells of settings, --debug, --allow and the exit status.",
 )
-
-HELP = {"--help", "-h"}
 
 ALIASES = {
     "anomaly_map": "map",
@@ -58,25 +55,29 @@ _running: list[App] = []
 """The command that is running."""
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Run the `magtwin` command; `arguments` default to those of the command line."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+def main(arguments: list[str], *, tell: Callable[[], str] | None = None) -> None:
+    """Run the `magtwin` command, or print the text that `tell` gives in place of it."""
     debug = "--debug" in arguments
     _end_by_exceptions()
     _running.clear()
     try:
         arguments, folders = _allowed([a for a in arguments if a != "--debug"])
         with watched(), _warnings_in_lines(), allow(*folders):
-            app(
-                arguments,
-                exit_on_error=False,
-                print_error=False,
-                result_action="return_value",
-                **_help_options(arguments),
-            )
+            if tell is not None:
+                print(tell())  # noqa: T201
+            else:
+                app(
+                    arguments,
+                    exit_on_error=False,
+                    print_error=False,
+                    result_action="return_value",
+                    **_help_options(arguments),
+                )
             sys.stdout.flush()  # a fault is reported here
     except CycloptsError as error:
-        _fail(_moved(arguments) or _with_file(error), status=2)
+        from magtwin.cli.mistakes import explain
+
+        _fail(explain(error), status=2)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:  # `magtwin info ... | head`
@@ -103,10 +104,11 @@ def main(arguments: list[str] | None = None) -> None:
         _fail(f"a fault in magtwin, {type(error).__name__}: {error}; please report it, with --debug")
 
 
-def _with_file(error: CycloptsError) -> str:
-    """The text of an error, with the file that a wrong value is in."""
-    text, file = str(error), getattr(getattr(error, "token", None), "source", "")
-    return f"{file}: {text}" if Path(file).is_absolute() and file not in text else text
+def refuse_command(arguments: list[str]) -> str:
+    """Refuse a command that there is not, with the one that is meant."""
+    from magtwin.cli.mistakes import unknown_command
+
+    _fail(unknown_command(arguments[0], more=arguments[1:2]), status=2)
 
 
 def _end_by_exceptions() -> None:
@@ -137,22 +139,6 @@ def _allowed(arguments: list[str]) -> tuple[list[str], list[str]]:
     if "" in folders:
         _fail("--allow wants a folder: --allow DIR", status=2)
     return others, folders
-
-
-MOVED = {
-    ("run", "--commands"): "--path FILE",
-    ("run", "--replay"): "--path FILE",
-    ("sweep", "--session"): "--sessions survey",
-}
-"""Options of earlier releases, by command, and what they are now."""
-
-
-def _moved(arguments: list[str]) -> str:
-    """The refusal of an option that has become another one; "" if there is none."""
-    for word in (word.partition("=")[0] for word in arguments[1:]):
-        if now := MOVED.get((arguments[0], word)):
-            return f"{word} is now {now}"
-    return ""
 
 
 def _stdout_full() -> str:
@@ -222,15 +208,25 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
 
     added = {"json": Json, "quiet": Quiet}
     parameters = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=annotation)
-        for name, annotation in added.items()
+        *signature.parameters.values(),
+        *(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False) for name in added),
     ]
+    hints = {p.name: _shown(p.name, added.get(p.name, p.annotation)) for p in parameters}
     wrapped.__signature__ = signature.replace(  # type: ignore[attr-defined]
-        parameters=[*signature.parameters.values(), *parameters]
+        parameters=[p.replace(annotation=hints[p.name]) for p in parameters]
     )
     wrapped.shares_options = True  # type: ignore[attr-defined]
-    wrapped.__annotations__ = {**function.__annotations__, **added}
+    wrapped.__annotations__ = {**function.__annotations__, **hints}
     return wrapped
+
+
+SHORT = {"out": "-o", "force": "-f", "quiet": "-q"}
+"""Short flags, by parameter."""
+
+
+def _shown(name: str, annotation: Any) -> Any:
+    """The annotation of a parameter, with its panel in the help and its short flag."""
+    return Annotated[annotation, Parameter(group=panel_of(name), alias=SHORT.get(name, ()))]
 
 
 _WRITTEN = ("out", "report", "rrd")
@@ -263,16 +259,16 @@ def _flags() -> dict[str, str]:
 
 
 def _help_options(arguments: list[str]) -> dict[str, Any]:
-    """Options that print help for a file or another program: no boxes, no broken lines."""
-    asked = HELP & set(arguments) or len(arguments) < 2  # `magtwin map` prints its help too
-    if sys.stdout.isatty() or not asked:
+    """Options that print help: for a file or another program no boxes, no broken lines."""
+    asked = FLAGS & set(arguments) or len(arguments) < 2  # `magtwin map` prints its help too
+    if not asked:
         return {}
-    from cyclopts.help import PlainFormatter
-
+    from magtwin.cli.help import Page
     from magtwin.cli.terminal import stdout_console
 
-    app.help_formatter = PlainFormatter()
-    return {"console": stdout_console()}
+    plain, command = not sys.stdout.isatty(), " ".join(app.parse_commands(arguments)[0]).removesuffix(" -h")
+    app.help_formatter = Page(command.removesuffix(" --help"), plain=plain, short="-h" in arguments)
+    return {"console": stdout_console()} if plain else {}
 
 
 @contextmanager
@@ -292,6 +288,6 @@ def _warnings_in_lines() -> Iterator[None]:
         yield
 
 
-def _fail(text: str, status: int = 1) -> None:
+def _fail(text: str, status: int = 1) -> NoReturn:
     print_error(text, style="1;31" if status == 2 else "")
     sys.exit(status)

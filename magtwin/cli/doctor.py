@@ -12,13 +12,13 @@ from magtwin.cli.terminal import Done
 ADDS = {
     "cluster": ("distributed", "work on a dask cluster (magtwin bench --dask, magtwin sweep --dask)"),
     "gym": ("gymnasium", "a Gymnasium environment (magtwin.gym)"),
-    "onnx": ("onnxruntime", "networks as ONNX (magtwin network export, magtwin export)"),
+    "onnx": ("onnxruntime", "networks as ONNX (magtwin model export, magtwin export)"),
     "pandas": ("pandas", "runs as pandas tables (Run.to_pandas)"),
     "physics": ("newton", "driving in Newton (magtwin run --engine newton)"),
     "ros": ("cyclonedds", "ROS 2 nodes on a machine without ROS (magtwin ros)"),
     "simready": ("simready-validate", "NVIDIA's SimReady profiles (magtwin validate --against simready)"),
     "validate": ("usd-validation-nvidia", "NVIDIA's asset validator (magtwin validate --against nvidia)"),
-    "view": ("pyvista", "pictures and films of stages (magtwin picture, magtwin film)"),
+    "view": ("pyvista", "pictures and films of stages (magtwin plot)"),
 }
 """The main package of each extra, and what it is for."""
 

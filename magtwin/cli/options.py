@@ -1,12 +1,14 @@
 """Options that several commands share: one type and one help text for each."""
 
+import warnings
 from dataclasses import dataclass
+from math import radians
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, RepairWarning
 
 
 def _whole(kind: type, tokens: Any) -> int:
@@ -52,6 +54,31 @@ def check_pace(pace: float) -> None:
         raise InputError(f"pace must be above 0 simulated seconds per second, got {pace:g}")
     if pace < LEAST_PACE:
         raise InputError(f"pace must be at least {LEAST_PACE:g}, got {pace:g}")
+
+
+MOST_HEADINGS = 720
+"""Most headings of a map."""
+
+
+def headings_rad(text: str) -> list[float]:
+    """Headings such as 0,90,180,270 [deg] in radians, each once, ascending; warns of repeated ones."""
+    try:
+        given = [float(word) % 360 for word in text.split(",")]
+    except ValueError:
+        given = []
+    degrees = sorted(set(given))
+    if not degrees or any(h != h for h in degrees):
+        raise InputError(
+            f"--headings-deg: headings are degrees with commas between, such as 0,90,180,270; got {text!r}"
+        )
+    if len(degrees) > MOST_HEADINGS:
+        raise InputError(f"--headings-deg names {len(degrees):,} headings; take {MOST_HEADINGS} at most")
+    if len(degrees) < len(given):
+        count = f"{len(degrees)} heading{'s' if len(degrees) > 1 else ''}"
+        warnings.warn(
+            f"--headings-deg {text}: {count}, as some are equal (360 is 0)", RepairWarning, stacklevel=2
+        )
+    return [radians(h) for h in degrees]
 
 
 Whole = Annotated[int, Parameter(converter=_whole)]

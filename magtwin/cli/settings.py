@@ -63,6 +63,16 @@ def is_setting(argument: Argument) -> bool:
     return argument.parameter.show is False
 
 
+def setting_text(typed: str, commands: tuple[str, ...], name: str = "") -> str:
+    """How the setting of a command is set, that was typed as an option; `name` is its own."""
+    key = (name or typed).removeprefix("--").replace("-", "_")
+    variable = _in_capitals("_".join((*commands, key)))
+    table = " ".join(commands)
+    return (
+        f"{typed} is a setting: put `{key} = ...` below [{table}] in magtwin.toml, or set MAGTWIN_{variable}"
+    )
+
+
 class Settings(Toml):
     """Options in magtwin.toml, which is read as any TOML of a user."""
 
@@ -82,12 +92,8 @@ class Environment(Env):
         """Refuse flags of settings, and add the options in the environment to those of the command line."""
         for argument in arguments:
             if is_setting(argument) and argument.tokens:
-                key = argument.name.removeprefix("--").replace("-", "_")
-                typed, table = argument.tokens[0].keyword, " ".join(commands)
-                variable = _in_capitals("_".join((*commands, key)))
                 raise CycloptsError(
-                    msg=f"{typed} is a setting: put `{key} = ...` below [{table}] in magtwin.toml, "
-                    f"or set {self.prefix}{variable}"
+                    msg=setting_text(str(argument.tokens[0].keyword), commands, argument.name)
                 )
         super().__call__(app, commands, arguments)
         if not commands:

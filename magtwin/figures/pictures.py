@@ -153,7 +153,7 @@ def show_stage(path: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 1
         InputError: The stage is missing, is not USD or shows nothing; or there is no display.
     """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise InputError(f"{path}: there is no display to show it on; magtwin picture draws it to a file")
+        raise InputError(f"{path}: there is no display to show it on; magtwin plot draws it to a file")
     plotter = plotter_of(size, window=True)
     try:
         _draw(plotter, path, size, None)

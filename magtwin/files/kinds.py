@@ -42,7 +42,7 @@ URDF = Kind(
 STAGE = Kind("a USD file", "magtwin info {file} describes it")
 ROBOT_FOLDER = Kind("the folder of a robot", "name the stage inside")
 SCENE_FOLDER = Kind("the folder of a scene", "magtwin run {file} drives in it; or name the stage inside")
-RUN = Kind("a run", "magtwin info {file} describes it, and magtwin picture, report and localize take it")
+RUN = Kind("a run", "magtwin info {file} describes it, and magtwin plot, report and localize take it")
 SWEEP = Kind(
     "a folder of runs", "name one of its .parquet files; magtwin report and magtwin dataset build take all"
 )
@@ -56,10 +56,10 @@ DATASET = Kind(
 RESULTS = Kind("a folder of results", "magtwin bench report {file} takes it")
 WEIGHTS = Kind("a network", "magtwin info {file} describes it, and magtwin evaluate and --network take it")
 ONNX = Kind("a network as ONNX, which runs without magtwin", "give its .safetensors or .pth")
-CHECKPOINT = Kind("a PyTorch checkpoint", "magtwin network convert {file} --out F.safetensors converts it")
+CHECKPOINT = Kind("a PyTorch checkpoint", "magtwin model convert {file} --out F.safetensors converts it")
 PATH = Kind("a path", "magtwin run SCENE --path {file} drives it")
 COMMANDS = Kind("a file of commands", "magtwin run SCENE --path {file} drives them")
-MODEL = Kind("a Tolles-Lawson model", "magtwin compensate apply RUN {file} --out F.parquet applies it")
+MODEL = Kind("a Tolles-Lawson model", "magtwin model compensate apply RUN {file} --out F.parquet applies it")
 JSON = Kind("a JSON", "give another file")
 PICTURE = Kind("a picture or film", "give the file that it was drawn from")
 PAGE = Kind("a page", "give the file that it was made from")

@@ -73,7 +73,7 @@ def followed(tmp_path_factory):
         for command in "".join(blocks("")).splitlines():
             name, *words = shlex.split(command)
             assert name == "magtwin"
-            if words[0] != "picture":  # needs OpenGL
+            if words[0] != "plot":  # needs OpenGL
                 main(words)
     return folder
 

@@ -30,7 +30,7 @@ def test_a_survey_becomes_a_map_that_info_and_plot_show(tmp_path, capsys, refusa
     folder = survey(tmp_path / "survey")
     layer, picture = tmp_path / "small.usdc", tmp_path / "small.png"
     main(["map", "import", str(folder), "--out", str(layer), "--licence", "CC0-1.0"])
-    main(["map", "plot", str(layer), "--out", str(picture)])
+    main(["plot", str(layer), "--out", str(picture)])
     assert picture.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     capsys.readouterr()
     main(["map", "info", str(layer), "--json"])

@@ -1,4 +1,4 @@
-"""`magtwin map plot`, `info`, `diff`, `upward`, and the card that `info` prints."""
+"""`magtwin map info`, `diff`, `upward`, and the card that `info` prints."""
 
 import json
 from dataclasses import replace
@@ -128,8 +128,8 @@ def test_diff_tells_and_draws_what_changed(tmp_path, layer, capsys):
 
 
 def test_a_picture_of_another_kind_is_refused_before_anything_is_read(tmp_path, capsys):
-    said = refused(capsys, "map", "plot", tmp_path / "gone.usdc", "--out", tmp_path / "a.jpg")
-    assert "a picture ends in .png or .svg" in said
-    assert "no such map" in refused(
-        capsys, "map", "plot", tmp_path / "gone.usdc", "--out", tmp_path / "a.png"
+    said = refused(capsys, "plot", tmp_path / "gone.usdc", "--out", tmp_path / "a.bmp")
+    assert "a picture ends in .png, .svg or .jpg, and a film in" in said
+    assert "no such run, stage, map" in refused(
+        capsys, "plot", tmp_path / "gone.usdc", "--out", tmp_path / "a.png"
     )

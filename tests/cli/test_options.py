@@ -40,7 +40,10 @@ def test_help_is_complete(words, capsys):
     assert "--empty-" not in text
     assert "[ARGS" not in text
     assert "--json:" in text
-    assert "--quiet:" in text
+    assert "--quiet, -q:" in text
+    assert "Examples:" in text
+    lines = [line.partition(":")[2] for line in text.splitlines() if line.startswith("  --")]
+    assert len(set(lines)) == len(lines)
     summary = ALL[words].help.splitlines()[0]
     assert summary.endswith((".", ":")) or len(words) == 1
     for argument in ALL[words].assemble_argument_collection(parse_docstring=True):

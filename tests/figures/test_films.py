@@ -144,15 +144,15 @@ def test_a_gif_lasts_as_long_as_it_should(run, lab_scene, tmp_path):
 def test_the_commands_draw_a_moment_a_film_and_a_stage(run, lab_scene, tmp_path, capsys):
     file = tmp_path / "run.parquet"
     write_parquet(run, file)
-    main(["picture", str(file), "--out", str(tmp_path / "run.png"), "--size", "160x90", "--time-s", "2"])
+    main(["plot", str(file), "--out", str(tmp_path / "run.png"), "--size", "160x90", "--at", "2"])
     view = ["--size", "160x90", "--camera", "top"]
-    main(["picture", str(lab_scene), "--out", str(tmp_path / "stage.png"), *view])
+    main(["plot", str(lab_scene), "--out", str(tmp_path / "stage.png"), *view])
     for name in ("run", "stage"):
         with Image.open(tmp_path / f"{name}.png") as image:
             assert image.size == SIZE
             assert np.ptp(np.asarray(image)) > 150
     pace = ["--size", "160x90", "--pace", "10", "--fps", "5"]
-    main(["film", str(file), "--out", str(tmp_path / "a.mp4"), *pace])
+    main(["plot", str(file), "--out", str(tmp_path / "a.mp4"), *pace])
     assert (tmp_path / "a.mp4").stat().st_size > 1000
     assert "changed since" not in capsys.readouterr().err
 

@@ -305,10 +305,10 @@ def test_what_is_no_recording_is_refused_before_a_viewer_starts(written, tmp_pat
 def test_the_picture_command_draws_a_recording_and_refuses_a_time_beyond_it(written, tmp_path, capsys):
     out = tmp_path / "run.png"
     with pytest.raises(SystemExit):
-        main(["picture", str(written), "--out", str(out), "--time-s", "9999"])
+        main(["plot", str(written), "--out", str(out), "--at", "9999"])
     assert re.search(r"the recording goes from 0 to [\d.]+ s; there is no 9999 s", capsys.readouterr().err)
     assert not out.exists()
-    main(["picture", str(written), "--out", str(out), "--time-s", "5", "--size", "640x400"])
+    main(["plot", str(written), "--out", str(out), "--at", "5", "--size", "640x400"])
     with Image.open(out) as image:
         assert image.size == (640, 400)
         assert np.std(np.asarray(image.convert("L"))) > 20
@@ -328,7 +328,7 @@ def test_a_picture_that_is_interrupted_leaves_no_viewer_and_no_file(written, tmp
                     found.append(stat.parent)
         return found
 
-    command = [sys.executable, "-m", "magtwin", "picture", str(written), "--out", str(tmp_path / "run.png")]
+    command = [sys.executable, "-m", "magtwin", "plot", str(written), "--out", str(tmp_path / "run.png")]
     (temporary := tmp_path / "temporary").mkdir()
     environment = {**os.environ, "TMPDIR": str(temporary)}
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env=environment)

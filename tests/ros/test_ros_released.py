@@ -54,7 +54,7 @@ def scene(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     real, out = real_data / "aprilab", tmp_path_factory.mktemp("aprilab")
     network = real / "models" / "nn_magnetometer_model_v0.0.1.pth"
     main(["map", "import", str(real / "maps"), "--out", str(out / "map.usdc"), "--quiet"])
-    main(["network", "convert", str(network), "--out", str(out / "net.safetensors"), "--quiet"])
+    main(["model", "convert", str(network), "--out", str(out / "net.safetensors"), "--quiet"])
     named = ["--map", str(out / "map.usdc"), "--network", str(out / "net.safetensors")]
     main(["scene", "aprilab", *named, "--out", str(out / "scene"), "--quiet"])
     return out / "scene" / "aprilab.usda"

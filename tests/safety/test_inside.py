@@ -226,7 +226,7 @@ COMMANDS = (
     "info S",
     "run S --out o",
     "drive S",
-    "picture S --out o.png",
+    "plot S --out o.png",
     "export S --out o",
     "validate S",
     "map survey S --out o.parquet",

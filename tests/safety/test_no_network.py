@@ -13,8 +13,8 @@ new room.toml
 scene lab --out lab
 info lab/lab.usda
 run lab/lab.usda --duration-s 2 --out run
-picture run/run.rrd --out recording.png
-picture lab/lab.usda --out lab.png
+plot run/run.rrd --out recording.png
+plot lab/lab.usda --out lab.png
 view run/run.rrd
 convert run/run.parquet drive.mcap
 convert run/run.parquet drive.usdc
@@ -78,7 +78,7 @@ def test_commands_ask_no_host_and_write_nothing_into_a_home_folder_but_caches(wa
     ends = [line.split(maxsplit=2) for line in done.stdout.splitlines() if line.startswith("ended:")]
     assert len(ends) == len(COMMANDS.strip().splitlines())
     failed = {line for _, status, line in ends if status != "0"}
-    assert failed <= {line for line in COMMANDS.splitlines() if line.startswith(("picture", "view run"))}
+    assert failed <= {line for line in COMMANDS.splitlines() if line.startswith(("plot", "view run"))}
     assert not notes.exists(), notes.read_text()
     home = Path(environment["HOME"])  # read-only, but not for the superuser
     files = [path.relative_to(home) for path in home.rglob("*") if path.is_file()]

@@ -1,17 +1,17 @@
-"""`magtwin compensate`: remove the platform's field from a run's readings, by Tolles and Lawson's model."""
+"""`magtwin model compensate`: remove the platform's field from a run, by Tolles and Lawson's model."""
 
 from pathlib import Path
 from typing import Literal
 
 from cyclopts import App
 
-from magtwin.cli.app import app
+from magtwin.cli.learn.model import model_app
 from magtwin.cli.options import Flag, Force
 from magtwin.cli.terminal import Done, check_output, step
 from magtwin.files.kinds import expected
 
 compensate_app = App(name="compensate", help="Remove the platform's field from a run (Tolles-Lawson).")
-app.command(compensate_app)
+model_app.command(compensate_app)
 
 
 @compensate_app.command
@@ -77,7 +77,7 @@ def apply(run: Path, model: Path, *, out: Path, force: Force = False) -> Done:
     run
         Run with field vectors (.parquet).
     model
-        Model that `magtwin compensate fit` wrote (.json).
+        Model that `magtwin model compensate fit` wrote (.json).
     out
         Compensated run to write, a .parquet file.
     """

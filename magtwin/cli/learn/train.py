@@ -48,8 +48,8 @@ def train(
     model
         paper: 20-512-512-512-512-1 (default); linear: Tolles-Lawson terms by ridge regression; hybrid: a
         linear base and a small network for its residual, kept only if it does better on validation; mixed: a
-        linear model whose coefficients differ between sessions, for `magtwin calibrate`; or a predictor kind
-        of an installed package.
+        linear model whose coefficients differ between sessions, for `magtwin model calibrate`; or a predictor
+        kind of an installed package.
     features
         Set of inputs, or names separated by commas. Default: full (the paper's 20); circular for a linear
         model, platform for a hybrid, session for a mixed model.

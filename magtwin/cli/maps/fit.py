@@ -11,8 +11,8 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from magtwin.cli.maps.map import LAYERS, Earth, Kernel, Sources, earth_nt, headings_rad, map_app
-from magtwin.cli.options import Flag, Force, Jobs, Lab, Licence, Seed, Whole
+from magtwin.cli.maps.map import LAYERS, Earth, Kernel, Sources, earth_nt, map_app
+from magtwin.cli.options import Flag, Force, Jobs, Lab, Licence, Seed, Whole, headings_rad
 from magtwin.cli.terminal import Done, check_output, progress, step
 from magtwin.errors import InputError
 from magtwin.io.surveys.columns import About, Columns

@@ -1,47 +1,14 @@
-"""`magtwin map plot`, `diff`, `upward`, `export` and `occupancy`: commands on what exists."""
+"""`magtwin map info`, `diff`, `upward`, `export` and `occupancy`: commands on what exists."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
-from magtwin.cli.maps.map import LAYERS, PICTURES, MapFile, headings_rad, map_app
+from magtwin.cli.maps.map import LAYERS, PICTURES, MapFile, map_app
 from magtwin.cli.options import Force
 from magtwin.cli.terminal import Done, check_output, print_report, step
-
-
-@map_app.command(name="plot")
-def map_plot(
-    file: MapFile,
-    *,
-    out: Path,
-    quantity: Literal["field", "gradient", "variance", "mask", "headings"] = "field",
-    headings_deg: str | None = None,
-    force: Force = False,
-) -> Done:
-    """Draw a map as filled contours, one panel per heading.
-
-    Parameters
-    ----------
-    out
-        Picture to write (.png or .svg).
-    quantity
-        The field, its gradient along the floor, its standard deviation (variance), the masked nodes (mask),
-        or each heading minus the mean of all headings (headings).
-    headings_deg
-        Headings to draw [deg], such as 0,90,180,270. Default: the map's, or four of them if it has more than
-        eight.
-    """
-    from magtwin.figures.canvas import save
-    from magtwin.figures.maps import draw_map
-    from magtwin.io.map_files import open_map
-
-    check_output(out, PICTURES, "a picture", force=force)
-    angles = None if headings_deg is None else headings_rad(headings_deg)
-    step("Drawing the map")
-    save(draw_map(open_map(file), what=quantity, headings=angles), out, force=force)
-    return Done(wrote=out)
 
 
 @map_app.command(name="info")

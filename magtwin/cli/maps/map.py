@@ -1,20 +1,15 @@
 """The `magtwin map` group, and options that its commands share."""
 
-import warnings
-from math import radians
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.errors import InputError, RepairWarning
+from magtwin.errors import InputError
 
-map_app = App(name="map", help="Import, fit, validate, compare and draw anomaly maps.")
+map_app = App(name="map", help="Import, fit, survey, validate and compare anomaly maps.")
 app.command(map_app)
-
-MOST_HEADINGS = 720
-"""Most headings of a map."""
 
 LAYERS = (".usdc", ".usd")
 PICTURES = (".png", ".svg")
@@ -43,27 +38,6 @@ Earth = Annotated[
     ),
 ]
 Sources = Annotated[Path, Parameter(required=True)]
-
-
-def headings_rad(text: str) -> list[float]:
-    """Headings such as 0,90,180,270 [deg] in radians, each once, ascending; warns of repeated ones."""
-    try:
-        given = [float(word) % 360 for word in text.split(",")]
-    except ValueError:
-        given = []
-    degrees = sorted(set(given))
-    if not degrees or any(h != h for h in degrees):
-        raise InputError(
-            f"--headings-deg: headings are degrees with commas between, such as 0,90,180,270; got {text!r}"
-        )
-    if len(degrees) > MOST_HEADINGS:
-        raise InputError(f"--headings-deg names {len(degrees):,} headings; take {MOST_HEADINGS} at most")
-    if len(degrees) < len(given):
-        count = f"{len(degrees)} heading{'s' if len(degrees) > 1 else ''}"
-        warnings.warn(
-            f"--headings-deg {text}: {count}, as some are equal (360 is 0)", RepairWarning, stacklevel=2
-        )
-    return [radians(h) for h in degrees]
 
 
 def earth_nt(text: str) -> tuple[float, float, float]:

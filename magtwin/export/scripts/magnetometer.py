@@ -19,7 +19,7 @@ class Lap:
     """A robot that drives the figure of eight, and its magnetometer."""
 
     def __init__(self, stage, network):
-        """Read a scene of magtwin's, and the file that `magtwin network export W.safetensors` wrote."""
+        """Read a scene of magtwin's, and the file that `magtwin model export W.safetensors` wrote."""
         self.stage, self.file = stage, network
         self.network = onnxruntime.InferenceSession(network)
         self.inputs = json.loads(self.network.get_modelmeta().custom_metadata_map["features"])

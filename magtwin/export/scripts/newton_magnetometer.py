@@ -2,7 +2,7 @@
 
     python newton_magnetometer.py STAGE.usda NETWORK.onnx READINGS.csv
 
-STAGE is a scene of magtwin's, NETWORK what `magtwin network export WEIGHTS.safetensors --out NETWORK.onnx`
+STAGE is a scene of magtwin's, NETWORK what `magtwin model export WEIGHTS.safetensors --out NETWORK.onnx`
 wrote. Needs magnetometer.py beside it, newton[sim], newton-usd-schemas, onnxruntime, numpy and usd-core, and
 nothing of magtwin.
 """

@@ -193,7 +193,7 @@ class TollesLawson:
                 raise ValueError(f"fitted to {data['vector']} vectors; fit it again")
         except (ValueError, KeyError, TypeError, IndexError, OSError, RecursionError) as error:
             raise InputError(
-                f"{file}: not a Tolles-Lawson model as `magtwin compensate fit` writes it "
+                f"{file}: not a Tolles-Lawson model as `magtwin model compensate fit` writes it "
                 f"({type(error).__name__}: {error})"
             ) from error
         columns = sum(find("Tolles-Lawson term", term, TERMS) for term in model.terms)

@@ -152,12 +152,12 @@ def model_card(result: TrainingResult, name: str, checksum: str) -> str:
 
 
 def widened_card(card: str, before: str, after: str, predictor: Predictor) -> str:
-    """The card of a model that `magtwin network widen` made of another: its card with the new SHA-256."""
+    """The card of a model that `magtwin model widen` made of another: its card with the new SHA-256."""
     robots, readings = (predictor.metadata[f"wide_{name}"] for name in ("robots", "readings"))
     sd = 0.0 if predictor.wide is None else predictor.wide.mean_nt
     text = (
         f"On robots other than that of its training the standard deviation is {sd:.0f} nT (root mean square "
-        f"of training rows). `magtwin network widen` learned it from {readings:,} readings of {robots} "
+        f"of training rows). `magtwin model widen` learned it from {readings:,} readings of {robots} "
         "robots."
     )
     return f"{card.replace(before, after)}\n## On other robots\n\n{_wrapped(text)}\n"

@@ -262,14 +262,14 @@ def test_the_commands_calibrate_and_refuse_to_widen_what_is_wide(weights, tmp_pa
     mt.save_map(FIELD, tmp_path / "map.usdc")
     words = [weights, tmp_path / "drive.parquet", "--map", tmp_path / "map.usdc", "--out"]
     words.append(tmp_path / "now.safetensors")
-    main(["calibrate", *map(str, words), "--json"])
+    main(["model", "calibrate", *map(str, words), "--json"])
     out, err = capsys.readouterr()
     assert "it lasts 20 s" in err
     assert json.loads(out)
     assert load_predictor(tmp_path / "now.safetensors").intervals == "calibrated"
     words[1:1] = ["--runs"]
     with pytest.raises(SystemExit):
-        main(["network", "widen", *map(str, words[:-1]), str(tmp_path / "wide.safetensors")])
+        main(["model", "widen", *map(str, words[:-1]), str(tmp_path / "wide.safetensors")])
     assert "a mixed model learned how robots differ in its training" in capsys.readouterr().err
 
 

@@ -107,7 +107,7 @@ def test_the_command_widens_a_file_and_carries_its_card_over(tmp_path, capsys):
     for k, path in enumerate(runs):
         a_robot(k).save(path)
     words = ["--runs", *map(str, runs), "--map", str(tmp_path / "map.usdc"), "--out", str(out), "--json"]
-    main(["network", "widen", str(given), *words])
+    main(["model", "widen", str(given), *words])
     figures = json.loads(capsys.readouterr().out)["figures"]
     made = load_predictor(out)
     assert figures["sd, other robots"]["value"] == pytest.approx(made.wide.mean_nt)

@@ -1,0 +1,140 @@
+"""`magtwin model`: convert, export, widen and calibrate networks; `learn.compensate` adds its own."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, Parameter
+
+from magtwin.cli.app import app
+from magtwin.cli.options import Flag, Force, Licence
+from magtwin.cli.terminal import Done, check_output, step
+
+model_app = App(name="model", help="Convert, export and calibrate networks; compensate the platform's field.")
+app.command(model_app)
+
+
+@model_app.command
+def convert(pth: Path, *, out: Path, licence: Licence = "", force: Force = False) -> Done:
+    """Convert a released checkpoint (.pth) to safetensors, without executing its content.
+
+    Parameters
+    ----------
+    pth
+        Checkpoint with the weights and the two scalers.
+    out
+        File to write, .safetensors.
+    licence
+        Licence of the weights, an SPDX identifier such as MIT, kept in their metadata.
+    """
+    from magtwin.learn.models.network import convert as convert_file
+
+    check_output(out, (".safetensors",), "a network", force=force)
+    step("Reading the checkpoint")
+    net = convert_file(pth, out, licence=licence, force=force)
+    return Done(net.report(str(out)), out)
+
+
+@model_app.command
+def export(weights: Path, *, out: Path, force: Force = False) -> Done:
+    """Export a network as ONNX, which runs in onnxruntime without torch and without magtwin.
+
+    The input is float64 features in their units, as magtwin info lists them; the outputs are the disturbance
+    and the standard deviation of its error [nT]. Scalers are inside. onnxruntime is compared with torch
+    before the file is written. Needs the extra onnx.
+
+    Parameters
+    ----------
+    weights
+        Weights, .safetensors or .pth.
+    out
+        File to write, .onnx.
+    """
+    from magtwin.learn.inference.onnx import export_onnx
+
+    check_output(out, (".onnx",), "an ONNX file", force=force)
+    step("Exporting the network")
+    report = export_onnx(weights, out, force=force)
+    return Done(report, out)
+
+
+@model_app.command
+def widen(
+    weights: Path,
+    *,
+    runs: Annotated[list[Path], Parameter(consume_multiple=True)],
+    map: Path,  # noqa: A002
+    out: Path,
+    force: Force = False,
+) -> Done:
+    """Learn how wide a model's intervals are on robots that it was not trained on.
+
+    Predictions do not change. The new intervals hold on any robot but that of the training, which keeps its
+    own.
+
+    Parameters
+    ----------
+    weights
+        Weights of any kind but mixed, which learns this in its training.
+    runs
+        Recordings of at least 4 other robots, or of plants (`magtwin sweep --plant all:1`).
+    map
+        Map that the weights were trained on: a layer or stage, or a folder of survey CSVs.
+    out
+        File to write, .safetensors. A model card beside the weights is carried over.
+    """
+    from magtwin.tasks.learning import widen as widen_file
+
+    check_output(out, (".safetensors",), "a network", force=force)
+    step("Reading the recordings")
+    return Done(widen_file(weights, runs, anomaly_map=map, out=out, force=force).report(str(out)), out)
+
+
+@model_app.command
+def calibrate(
+    weights: Path,
+    run: Path,
+    *,
+    map: Path,  # noqa: A002
+    out: Path,
+    duration_s: float | None = None,
+    pose_sd_m: float = 0.0,
+    pose_from_map: Flag = False,
+    force: Force = False,
+) -> Done:
+    """Calibrate a mixed model by a labelled drive at the start of a session.
+
+    Drive for a minute in curves to all sides, with poses of another source than the map. The new weights
+    predict in that session, until the robot is switched off; their metadata name the drive and the model.
+
+    Parameters
+    ----------
+    weights
+        Weights of a mixed model, .safetensors (`magtwin train --model mixed`).
+    run
+        The drive, of any kind that `magtwin dataset build` reads.
+    map
+        Map that the weights were trained on: a layer or stage, or a folder of survey CSVs.
+    out
+        Weights to write, .safetensors.
+    duration_s
+        Length of the part to use, from the start [s]. Default: all.
+    pose_sd_m
+        Standard deviation of the drive's positions, each axis [m].
+    pose_from_map
+        The poses were estimated on the map: warn.
+    """
+    from magtwin.tasks.learning import calibrate as calibrate_files
+
+    check_output(out, (".safetensors",), "a network", force=force)
+    step("Calibrating")
+    calibrated = calibrate_files(
+        weights,
+        run,
+        anomaly_map=map,
+        duration_s=duration_s,
+        pose_sd_m=pose_sd_m,
+        pose_from_map=pose_from_map,
+        out=out,
+        force=force,
+    )
+    return Done(calibrated.report(str(out)), out)
