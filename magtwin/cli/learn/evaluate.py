@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Flag, Force, Names, Seed, pairs
+from magtwin.cli.options import Flag, Force, Names, Seed, pairs, reads_recordings
 from magtwin.cli.terminal import Done, progress, stdout_console, step
 from magtwin.errors import InputError
 
@@ -22,6 +22,7 @@ MOST_CASES = 7
 
 
 @app.command
+@reads_recordings
 def evaluate(
     *weights: Annotated[Path, Parameter(required=True)],
     out: Path,

@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Flag, Force, Licence
+from magtwin.cli.options import Flag, Force, Licence, reads_recordings
 from magtwin.cli.terminal import Done, check_output, step
 
 model_app = App(name="model", help="Convert, export and calibrate networks; compensate the platform's field.")
@@ -90,6 +90,7 @@ def widen(
 
 
 @model_app.command
+@reads_recordings
 def calibrate(
     weights: Path,
     run: Path,

@@ -6,7 +6,15 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import RECORDED, Force, OutUnit, RecordedOptions, RunScene, UsdFps
+from magtwin.cli.options import (
+    RECORDED,
+    Force,
+    OutUnit,
+    RecordedOptions,
+    RunScene,
+    UsdFps,
+    reads_recordings,
+)
 from magtwin.cli.terminal import Done, progress, silence, step
 
 
@@ -28,6 +36,7 @@ def info(file: Path, *, recorded: RecordedOptions = RECORDED) -> Done:
 
 
 @app.command
+@reads_recordings
 def view(
     *files: Annotated[Path, Parameter(required=True)],
     scene: RunScene = None,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, RunScene
+from magtwin.cli.options import Force, RunScene, reads_recordings
 from magtwin.cli.terminal import (
     Done,
     announce,
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 
 @app.command
+@reads_recordings
 def report(
     *runs: Annotated[Path, Parameter(required=True)],
     out: Path = Path("report.html"),
@@ -51,6 +52,7 @@ def report(
 
 
 @app.command
+@reads_recordings
 def compare(
     a: Path,
     b: Path,

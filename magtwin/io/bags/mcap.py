@@ -251,7 +251,8 @@ class McapReader:
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, records.Channel] = {}
         self._chunks: dict[int, int] = {}  # place and length
-        self._indexes = array("q")  # place and length of indexes of messages
+        self._indexes = array("q")  # place and length of indexes of messages, and the place of their chunk
+        self._spans: dict[int, tuple[int, int]] = {}  # first and last time of each chunk
         self._loose = array("q")  # channel, time of receipt, place and size of messages outside of chunks
         try:
             same = sum(a == b for a, b in zip(self._file.read(len(MAGIC)), MAGIC, strict=False))
@@ -289,10 +290,12 @@ class McapReader:
         for channel in np.unique(loose[:, 0]).tolist():
             parts.setdefault(channel, []).append(loose[loose[:, 0] == channel, 1])
         if len(self._indexes):
-            for place, length in np.array(self._indexes, np.int64).reshape(-1, 2).tolist():
+            for place, length, chunk in np.array(self._indexes, np.int64).reshape(-1, 3).tolist():
                 raw = self._at(place, length)
                 entries = np.frombuffer(raw, "<i8", (len(raw) - 6) // 16 * 2, 6) if len(raw) > 6 else ()
-                parts.setdefault(int.from_bytes(raw[:2], "little"), []).append(np.asarray(entries)[::2])
+                times = np.asarray(entries, np.int64)[::2]
+                times = np.clip(times, *self._spans[chunk]) if chunk in self._spans else times
+                parts.setdefault(int.from_bytes(raw[:2], "little"), []).append(times)
         elif self._chunks:
             for number, messages in self.messages(parts.keys()).items():
                 parts[number] = [messages.received]
@@ -364,6 +367,8 @@ class McapReader:
                     chunk = records.ChunkIndex.read(ReadDataStream(BytesIO(content)))
                     self._chunks[chunk.chunk_start_offset + _HEAD.size] = chunk.chunk_length - _HEAD.size
                     self.compression.add(chunk.compression)
+                    begin_end = chunk.message_start_time, chunk.message_end_time
+                    self._spans[chunk.chunk_start_offset + _HEAD.size] = begin_end
             except _DAMAGED:
                 return begin, False
             at += length
@@ -371,7 +376,7 @@ class McapReader:
 
     def _scan(self, at: int, end: int) -> None:
         """Go through the records outside of chunks; those behind a damaged one are found by the index."""
-        indexed, self._chunks = self._chunks, {}
+        indexed, self._chunks, place = self._chunks, {}, 0
         while at + _HEAD.size <= end:
             head = self._at(at, ROOM)
             opcode, length = _HEAD.unpack_from(head)
@@ -380,12 +385,12 @@ class McapReader:
                 if not self.whole and body + length > end:
                     break  # the rest is missing
                 self.damaged.add(body)
-                at = min((place - _HEAD.size for place in indexed if place > body), default=end)
+                at = min((other - _HEAD.size for other in indexed if other > body), default=end)
                 continue
             if opcode == Opcode.CHUNK:
-                self._chunks[body] = length
+                self._chunks[body], place = length, body
             elif opcode == Opcode.MESSAGE_INDEX:
-                self._indexes.extend((body, length))
+                self._indexes.extend((body, length, place))
             elif opcode == Opcode.MESSAGE and length >= ROOM - _HEAD.size:
                 channel, _, received = struct.unpack_from("<HIq", head, _HEAD.size)
                 numbers = channel, received, at + ROOM, length - (ROOM - _HEAD.size)

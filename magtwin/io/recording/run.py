@@ -91,8 +91,11 @@ class Recording:
         run: Its run, see `magtwin.io.bags.read_bag`.
     """
 
-    def __init__(self, bag: Bag, names: Mapping[str, str], *, survey: bool = False) -> None:
-        self._bag, self._names, self._survey = bag, names, survey
+    def __init__(
+        self, bag: Bag, names: Mapping[str, str], *, survey: bool = False, most: int | None = None
+    ) -> None:
+        """Find the roles; `most` are the bytes of the beginning that are read, None for all of the bag."""
+        self._bag, self._names, self._survey, self._most = bag, names, survey, most
         self._columns: Columns = {}
         self._read: set[str] = set()
         self._frameless: dict[str, list[str]] = {}
@@ -108,7 +111,7 @@ class Recording:
     @cached_property
     def tree(self) -> Tree:
         """The frames of the robot."""
-        return Tree(self._bag)
+        return Tree(self._bag, self._most)
 
     def read(self, unit: Unit | None, scale: float | None) -> None:
         """Read all roles."""
@@ -289,7 +292,7 @@ class Recording:
             check_kind(topic, bag, name)
         fitting = {t: [told[t]] if t in told else candidates(t, bag, told.values()) for t in roles}
         fitting[POSE] = [] if self._by_tf else fitting[POSE]
-        messages = bag.messages(chain(*fitting.values()))
+        messages = bag.messages(chain(*fitting.values()), self._most)
         found: dict[Topic, str] = {}
         notes: dict[str, list[str]] = {"its type": [], "its name": []}
         for topic, several in fitting.items():

@@ -31,26 +31,19 @@ class Tree:
         moving: By frame: its parent, the stamps [ns], and its origin and axes (xyzw) there, shape (M, 7).
     """
 
-    def __init__(self, bag: Bag) -> None:
+    def __init__(self, bag: Bag, most: int | None = None) -> None:
         self.static = StaticFrames()
         self.moving: dict[str, tuple[str, Index, Array]] = {}
-        names = [
-            name
-            for name, kind in bag.kinds.items()
-            if kind == TF.kind and name.endswith((TF.name, TF_STATIC.name))
-        ]
-        told = [
-            name
-            for name in bag.kinds
-            if bag.kinds[name] == DESCRIPTION.kind and name.endswith("robot_description")
-        ]
+        ends = {TF.name: TF.kind, TF_STATIC.name: TF.kind, "robot_description": DESCRIPTION.kind}
+        pairs = [(name, end) for name in bag.kinds for end in ends if name.endswith(end)]
+        names = {name: end for name, end in pairs if bag.kinds[name] == ends[end]}
         edges: dict[tuple[str, str], list[tuple[Index, Array]]] = {}
         with np.errstate(over="ignore", invalid="ignore"):
-            for name, messages in bag.messages([*names, *told]).items():
+            for name, messages in bag.messages(names, most).items():
                 with suppress(InputError):
-                    if name in told:
-                        text = decode(bag.layout(name), messages, ["data"])["data"][-1:]
-                        self.static.describe(*(each[:MOST_DESCRIPTION] for each in text)) if text else None
+                    if names[name] not in (TF.name, TF_STATIC.name):
+                        for text in decode(bag.layout(name), messages, ["data"])["data"][-1:]:
+                            self.static.describe(text[:MOST_DESCRIPTION])
                         continue
                     for each in transforms(messages, partial(bag.layout, name)):
                         if name.endswith(TF_STATIC.name):
