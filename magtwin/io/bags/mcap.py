@@ -150,9 +150,12 @@ class McapWriter:
 
     def _cut(self, batches: Sequence[Batch]) -> Iterator[tuple[Index, Bytes, dict[int, Any]]]:
         """Chunks of messages in the order of their times: times, content, and the index by channel."""
-        for batch in batches:
-            _fill_heads(batch)
         times, which = in_time(batches)
+        number = np.array([batch.connection.id for batch in batches], np.int64)[which]
+        for k, batch in enumerate(batches):
+            same = np.flatnonzero(number == batch.connection.id)
+            first = self.counts[batch.connection.id]
+            _fill_heads(batch, first + np.searchsorted(same, np.flatnonzero(which == k)))
         sizes = np.array([b.rows.shape[1] for b in batches], np.int64)[which]
         ends = np.cumsum(sizes)
         done = [0] * len(batches)
@@ -206,13 +209,14 @@ class McapWriter:
         )
 
 
-def _fill_heads(batch: Batch) -> None:
+def _fill_heads(batch: Batch, sequence: NDArray[np.intp]) -> None:
     """Make each row a message record: opcode, length, channel, sequence, and the time twice."""
     count, width = batch.rows.shape
     formats = ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"]
     heads = np.zeros(count, np.dtype({"names": list("olcstp"), "formats": formats}))
     heads["o"], heads["l"], heads["c"] = Opcode.MESSAGE, width - _HEAD.size, batch.connection.id
     heads["t"] = heads["p"] = batch.received
+    heads["s"] = sequence
     batch.rows[:, :ROOM] = heads.view(np.uint8).reshape(count, ROOM)
 
 

@@ -76,6 +76,9 @@ class Topic:
     frame: str = ""
     """Attribute of the sender with the frame of the header. Default: no header."""
 
+    by: tuple[str, ...] = ()
+    """Columns of flags that select the text of a message; messages are written for equal flags at a time."""
+
     more: Callable[[Columns, NDArray[np.int64], Sender], Fields] = lambda c, stamp, sender: {}
     """Fields of messages beyond the header and the columns of `reads`; also called with the stamps [ns]."""
 
@@ -233,6 +236,33 @@ def _transforms(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
 def _static(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
     links = [(link.parent, link.name, np.array(link.p), np.array(link.q_xyzw)) for link in sender.links]
     return transform_fields(stamp, links)
+
+
+_FAULTS: Mapping[str, tuple[str, int, str]] = {
+    "flag_lost_lock": ("magnetometer", 2, "it lost lock"),
+    "flag_outside_map": ("magnetometer", 1, "outside the map"),
+    "flag_out_of_distribution": ("network", 1, "an input left its training range"),
+    "flag_pose_lost": ("motion capture", 1, "it lost the robot"),
+    "flag_bump": ("drive", 1, "it touched an obstacle"),
+}
+"""By flag: the part that it is about, its level in a DiagnosticStatus (1: warn, 2: error), and its text."""
+
+
+def _diagnosed(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
+    """The state of each part of the robot; the flags of all rows are equal."""
+    known = {flag: fault for flag, fault in _FAULTS.items() if flag in c}
+    fields: Fields = {"header.stamp": stamp, "status": len({part for part, _, _ in known.values()})}
+    for k, name in enumerate(dict.fromkeys(part for part, _, _ in known.values())):
+        faults = [(level, text) for flag, (part, level, text) in known.items() if part == name and c[flag][0]]
+        fields |= {
+            f"status.{k}.name": name,
+            f"status.{k}.level": max((level for level, _ in faults), default=0),
+        }
+        fields |= {
+            f"status.{k}.message": "; ".join(text for _, text in faults) or "ok",
+            f"status.{k}.values": 0,
+        }
+    return fields
 
 
 def _scan(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
@@ -423,6 +453,17 @@ SCAN = Topic(
     more=_scan,
     reads={"sensor_msgs/msg/LaserScan": {"stamp": "header.stamp"}},
 )
+OCCUPANCY = Topic(name="/map", kind="nav_msgs/msg/OccupancyGrid", qos=LATCHED, sent="once")
+FIELD = Topic(name="/anomaly_map", kind="sensor_msgs/msg/PointCloud2", qos=LATCHED, sent="once")
+DIAGNOSTICS = Topic(
+    name="/diagnostics",
+    kind="diagnostic_msgs/msg/DiagnosticArray",
+    needs=("t",),
+    sent="ticks",
+    every_s=1.0,
+    more=_diagnosed,
+    by=tuple(_FAULTS),
+)
 NAMES = Topic(name="/magtwin/columns", kind="std_msgs/msg/String", qos=LATCHED, sent="once")
 READING = Topic(
     name="/magtwin/reading",
@@ -436,7 +477,7 @@ TOPICS: Mapping[str, Topic] = MappingProxyType(
         topic.name: topic
         for topic in (
             *(POSE, ODOMETRY, IMU, BATTERY, MAGNITUDE, VECTOR, COMMAND, JOINTS, SCAN),
-            *(TF, TF_STATIC, DESCRIPTION, CLOCK, NAMES, READING),
+            *(TF, TF_STATIC, DESCRIPTION, CLOCK, DIAGNOSTICS, OCCUPANCY, FIELD, NAMES, READING),
         )
     }
 )
