@@ -194,6 +194,7 @@ class Recording:
                     f"not the poses of {signal.name}, which are an estimate (--pose-topic {signal.name})"
                 )
             self.doubts.append(f"poses of {placed[1]}")
+            self.roles[ROLES[POSE].noun] = TF.name
             self._place(placed[0], f"topic {placed[1]}" if placed[0].name != TF.name else placed[1])
         elif self._by_tf:
             raise InputError(
