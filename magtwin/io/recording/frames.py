@@ -9,8 +9,8 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
-from pathlib import Path
 from typing import Any, NamedTuple
+from xml.etree.ElementTree import ParseError, fromstring
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,21 +97,17 @@ class StaticFrames:
 
     def describe(self, urdf: str) -> None:
         """Take the fixed joints of a description, where /tf_static has none; those of no damaged one."""
-        from magtwin.urdf.description.model import origin_numbers
-        from magtwin.urdf.source.markup import parse_markup
-
         try:
-            joints = parse_markup(urdf.encode(), Path("robot_description")).root.findall("joint")
-        except InputError:
+            joints = [] if "<!" in urdf.replace("<!--", "") else fromstring(urdf).findall("joint")
+            for joint in joints:
+                parent, child, origin = map(joint.find, ("parent", "child", "origin"))
+                if joint.get("type") == "fixed" and parent is not None and child is not None:
+                    told = {} if origin is None else origin.attrib
+                    xyz, rpy = (np.array(told.get(key, "0 0 0").split(), float) for key in ("xyz", "rpy"))
+                    if plain(name := child.get("link", "")) not in self.parents and len(xyz) == len(rpy) == 3:
+                        self.add(parent.get("link", ""), name, xyz, quat_from_rpy(rpy))
+        except (ParseError, ValueError):
             return
-        for joint in joints:
-            ends = [
-                element.get("link") or "" for element in (*joint.findall("parent"), *joint.findall("child"))
-            ]
-            if joint.get("type") == "fixed" and len(ends) == 2 and plain(ends[1]) not in self.parents:
-                origin = joint.find("origin")
-                xyz, rpy, given = origin_numbers(joint if origin is None else origin)
-                self.add(ends[0], ends[1], xyz, quat_from_rpy(rpy) if given is None else given)
 
     def mount(self, frame: str) -> Mount | None:
         """Where a frame is on the robot; None if that is not known.
