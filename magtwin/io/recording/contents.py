@@ -105,12 +105,15 @@ def _field(bag: Bag, most: int | None, reading: Mapping[str, Any]) -> tuple[Repo
         except Exception as error:
             fault = f"it cannot be read ({type(error).__name__}: {error})"[:200]
     roles = {} if recording is None else recording.roles
+    texts = [str(each.message).removeprefix(f"{bag.path}: ") for each in doubts]
     if fault:
-        return Report("", (), dict.fromkeys(NEXT, f"no, because {fault}")), roles
+        brief = re.split(r" \(|; ", fault)[0]
+        return Report(
+            "", (), dict.fromkeys(NEXT, f"no, because {brief}") | {"doubts": [fault, *texts]}
+        ), roles
     assert recording is not None
     run, said = recording.run, recording.run.metadata
     told |= {"taken": said["taken"]} if "taken" in said else {}
-    texts = [str(each.message).removeprefix(f"{bag.path}: ") for each in doubts]
     told |= {"doubts": texts} if texts else {}
     report = _examined(run, roles, f"{said['field_unit']}, {said['field_unit_told']}")
     fit = {use: str(report.metadata[use]) for use in NEXT}
