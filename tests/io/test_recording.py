@@ -191,7 +191,8 @@ def test_a_flipped_byte_costs_at_most_one_chunk(tmp_path, monkeypatch):
 
 
 def test_info_counts_as_rosbags_does_and_ends_for_no_readable_bag(tmp_path):
-    bag = record(tmp_path / "bag", {"/a/mag": field(), "/b/mag": field(count=150), "/pose": poses()})
+    room = [(t, *magnetic(t, 41e-6 + 1e-6 * np.sin(t), 1e-6, 0.0)) for t in T]
+    bag = record(tmp_path / "bag", {"/a/mag": room, "/b/mag": room[:150], "/pose": poses()})
     for path in (bag, as_db3(bag, tmp_path / "db3")):
         report = info_of(path)
         with Reader(path) as reader:

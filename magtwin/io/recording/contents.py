@@ -108,9 +108,8 @@ def _field(bag: Bag, most: int | None, reading: Mapping[str, Any]) -> tuple[Repo
     texts = [str(each.message).removeprefix(f"{bag.path}: ") for each in doubts]
     if fault:
         brief = re.split(r" \(|; ", fault)[0]
-        return Report(
-            "", (), dict.fromkeys(NEXT, f"no, because {brief}") | {"doubts": [fault, *texts]}
-        ), roles
+        unfit = dict.fromkeys(NEXT, f"no, because {brief}")
+        return Report("", (), {**unfit, "doubts": [fault, *texts]}), roles
     assert recording is not None
     run, said = recording.run, recording.run.metadata
     told |= {"taken": said["taken"]} if "taken" in said else {}
