@@ -128,7 +128,7 @@ class Magnetometer:
             outputs = [replace(topic, name=topic.name.replace("/qtfm/", "/predicted/")) for topic in outputs]
         self._outputs = [(bus.publisher(topic.name, topic.kind, topic.qos), topic) for topic in outputs]
         self._last_ns, self._begun_ns = 0, 0
-        self._outside, self._strange, self._read = 0, 0, 0
+        self._outside, self._strange, self._given = 0, 0, 0
         self._reader: Reader | None = None  # None: the map alone
         self._pose_late_ns = 0
         if twin.magnetometer is not None:
@@ -203,7 +203,7 @@ class Magnetometer:
             self._skip("the pose is outside the map")
             return
         self._strange += reading.outside_training
-        self._read += 1
+        self._given += 1
         if not np.isfinite(reading.b_total_nt):
             self._skip("the network gave no number")
             return
@@ -283,8 +283,8 @@ class Magnetometer:
             ),
             (self._outside, f"{self._outside} poses were outside the map"),
             (
-                self._strange > MANY * self._read,
-                f"{self._strange} of {self._read} readings were outside the network's training range",
+                self._strange > MANY * self._given,
+                f"{self._strange} of {self._given} readings were outside the network's training range",
             ),
             (others > 0, f"{others} others publish {magnitude.topic} too"),
         )
@@ -294,7 +294,7 @@ class Magnetometer:
             "out of distribution": str(self._strange),
             "units": self._sender.unit,
         }
-        self._outside = self._strange = self._read = 0
+        self._outside = self._strange = self._given = 0
         return [self._node.status("readings", "reading", silent, problems, values)]
 
 

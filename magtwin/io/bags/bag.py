@@ -131,7 +131,7 @@ class Bag:
         """The messages of topics, each in the order of receipt; of about its first `most` bytes."""
         wanted, room = set(topics), Room(self.path, self.files)
         parts: dict[str, list[Messages]] = {topic: [] for topic in wanted}
-        for reader in self.readers:
+        for reader in self.readers if wanted else ():
             chosen = {topic.id: topic for topic in reader.topics if topic.topic in wanted}
             for number, messages in reader.messages(chosen.keys(), most).items():
                 topic = chosen[number]

@@ -151,11 +151,13 @@ class McapWriter:
     def _cut(self, batches: Sequence[Batch]) -> Iterator[tuple[Index, Bytes, dict[int, Any]]]:
         """Chunks of messages in the order of their times: times, content, and the index by channel."""
         times, which = in_time(batches)
-        number = np.array([batch.connection.id for batch in batches], np.int64)[which]
+        ids = [batch.connection.id for batch in batches]
         for k, batch in enumerate(batches):
-            same = np.flatnonzero(number == batch.connection.id)
-            first = self.counts[batch.connection.id]
-            _fill_heads(batch, first + np.searchsorted(same, np.flatnonzero(which == k)))
+            rank = np.arange(len(batch.received))
+            if ids.count(ids[k]) > 1:  # a topic of several sizes, whose messages are numbered in time
+                same = np.flatnonzero(np.array(ids)[which] == ids[k])
+                rank = np.searchsorted(same, np.flatnonzero(which == k))
+            _fill_heads(batch, self.counts[ids[k]] + rank)
         sizes = np.array([b.rows.shape[1] for b in batches], np.int64)[which]
         ends = np.cumsum(sizes)
         done = [0] * len(batches)
