@@ -461,7 +461,7 @@ class McapReader:
         size, raw, codec = chunk.uncompressed_size, chunk.data, chunk.compression
         most = min(LARGEST_CHUNK, self._spare + MOST_RATIO * len(raw))
         if size > most or codec not in ("", "zstd", "lz4"):
-            if len(self._chunks) > 1:
+            if len(self._chunks) > 1 and (size > SPARE + MOST_RATIO * len(raw) or size <= most):
                 self.damaged.add(place)
                 return None
             raise InputError(
