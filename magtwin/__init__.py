@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from magtwin.files.folders import allow as allow
     from magtwin.io.formats import read_run, write_run
     from magtwin.io.provenance import repeat_of
+    from magtwin.io.recording.run import read_recording as read_recording
     from magtwin.io.surveys.survey import read_survey as read_survey
     from magtwin.io.sweeps import save_runs as save_runs
     from magtwin.learn.models.predictor import load_predictor as load_predictor
@@ -127,6 +128,7 @@ _NAMES = {
     "open_twin": "twin",
     "plot": "figures.plot",
     "read_results": "bench.results",
+    "read_recording": "io.recording.run",
     "read_survey": "io.surveys.survey",
     "reproduce": "io.provenance:repeat_of",
     "save_map": "usd.maps.layer",

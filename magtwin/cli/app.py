@@ -9,7 +9,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -17,7 +17,7 @@ from cyclopts import App, Parameter
 from cyclopts.exceptions import CycloptsError
 
 from magtwin.cli.help import FLAGS, panel_of
-from magtwin.cli.options import Json, Quiet
+from magtwin.cli.options import RECORDED, Json, Quiet, RecordedOptions
 from magtwin.cli.progress import watched
 from magtwin.cli.settings import Environment, Settings, is_setting
 from magtwin.cli.terminal import Done, output_mode, print_error, print_json, refusal
@@ -212,23 +212,26 @@ def share_options(group: App = app) -> None:
 def _with_output_options(command: App, function: Callable[..., Any]) -> Callable[..., Any]:
     """A command's function that takes --json and --quiet too, and shows the `Done` that it returns."""
     signature = inspect.signature(function)
+    records = getattr(function, "reads_recordings", False)
 
     @functools.wraps(function)
     def wrapped(*args: Any, json: bool = False, quiet: bool = False, **options: Any) -> None:
         from magtwin.files.outputs import reading
 
+        how = options.pop("recorded", RECORDED).options if records else {}
         _running[:] = [command]
         _read[:] = _files(signature.bind_partial(*args, **options).arguments)
-        with output_mode(as_json=json, quiet=quiet), reading(_read):
+        with output_mode(as_json=json, quiet=quiet), reading(_read), _recordings(how):
             done = function(*args, **options)
             if isinstance(done, Done):
                 done.show()
 
-    added = {"json": Json, "quiet": Quiet}
-    parameters = [
-        *signature.parameters.values(),
-        *(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False) for name in added),
-    ]
+    added = {"json": Json, "quiet": Quiet} | ({"recorded": RecordedOptions} if records else {})
+    defaults = {"recorded": RECORDED}
+    parameters = list(signature.parameters.values())
+    for name in added:
+        default = defaults.get(name, False)
+        parameters.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default))
     hints = {p.name: _shown(p.name, added.get(p.name, p.annotation)) for p in parameters}
     wrapped.__signature__ = signature.replace(  # type: ignore[attr-defined]
         parameters=[p.replace(annotation=hints[p.name]) for p in parameters]
@@ -236,6 +239,15 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
     wrapped.shares_options = True  # type: ignore[attr-defined]
     wrapped.__annotations__ = {**function.__annotations__, **hints}
     return wrapped
+
+
+def _recordings(options: dict[str, Any]) -> AbstractContextManager[None]:
+    """The options of robots' bags, if any were given."""
+    if not options:
+        return nullcontext()
+    from magtwin.io.formats import recordings
+
+    return recordings(**options)
 
 
 SHORT = {"out": "-o", "force": "-f", "quiet": "-q"}

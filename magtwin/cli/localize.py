@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Names, Seed, pairs
+from magtwin.cli.options import Force, Names, Seed, pairs, reads_recordings
 from magtwin.cli.ros import HERE, FramePrefix, WallS, Where, ros_app, spin
 from magtwin.cli.terminal import Done, announce, progress, step
 from magtwin.errors import InputError, hint
 
 
 @app.command
+@reads_recordings
 def localize(
     run: Path,
     *,

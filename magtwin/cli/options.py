@@ -1,10 +1,11 @@
 """Options that several commands share: one type and one help text for each."""
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import radians
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from cyclopts import Parameter
 
@@ -43,6 +44,8 @@ def pairs(
         table[name] = value
     return table
 
+
+Command = TypeVar("Command", bound=Callable[..., Any])
 
 LEAST_PACE = 0.001
 """Lowest pace: 17 minutes for a second of a run."""
@@ -211,7 +214,13 @@ Gamepad = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
-    """How a robot's own bag is read; options of the commands that read one and write another file."""
+    """How a robot's own bag is read; options of the commands that read one."""
+
+    field_topic: str | None = None
+    """Topic of the field in a robot's bag, if it has several."""
+
+    pose_topic: str | None = None
+    """Topic of the poses in a robot's bag, if it has several; tf: the pose of its base by /tf."""
 
     remap: Remap = None
     unit: Unit = None
@@ -220,10 +229,17 @@ class Recorded:
     @property
     def options(self) -> dict[str, Any]:
         """Options of `magtwin.io.formats.read_run`, as far as they were given."""
-        topics = pairs("remap", self.remap, OURS_THEIRS) or None
-        given = {"topics": topics, "unit": self.unit, "scale": self.scale}
+        chosen = {"/robot/qtfm/magnitude": self.field_topic, "/robot/enu/pose": self.pose_topic}
+        topics = pairs("remap", self.remap, OURS_THEIRS) | {n: t for n, t in chosen.items() if t}
+        given = {"topics": topics or None, "unit": self.unit, "scale": self.scale}
         return {name: value for name, value in given.items() if value is not None}
 
 
 RecordedOptions = Annotated[Recorded, Parameter(name="*")]
 RECORDED = Recorded()
+
+
+def reads_recordings(command: Command) -> Command:
+    """Give a command the options of robots' bags, which then hold for all runs that it reads."""
+    command.reads_recordings = True  # type: ignore[attr-defined]
+    return command

@@ -26,6 +26,7 @@ from magtwin.cli.options import (
     Session,
     Whole,
     check_pace,
+    reads_recordings,
 )
 from magtwin.cli.terminal import Done, announce, progress, silence, step
 from magtwin.errors import InputError
@@ -334,6 +335,7 @@ def record(
 
 
 @ros_app.command(name="replay")
+@reads_recordings
 def replay(
     run: Path,
     *,

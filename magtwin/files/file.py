@@ -133,12 +133,20 @@ def read_text(path: str | os.PathLike[str], what: str, kind: str, encoding: str 
 
 
 def sha256(path: str | os.PathLike[str]) -> str:
-    """SHA-256 of a file, lower-case hex."""
+    """SHA-256 of a file, lower-case hex; of a file that is as it was, the one that is known."""
     path = existing(path, "file")
     if path.is_dir():
         raise InputError(f"{path}: a folder; name the file in it")
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    status = path.stat()
+    key = str(path.resolve()), status.st_ino, status.st_size, status.st_mtime_ns
+    if key not in _SUMS:
+        with path.open("rb") as file:
+            _SUMS[key] = hashlib.file_digest(file, "sha256").hexdigest()
+    return _SUMS[key]
+
+
+_SUMS: dict[tuple[str, int, int, int], str] = {}
+"""Checksums by name, inode, size and time of change, since several readers of a file each need it."""
 
 
 def check_zip(path: Path, archive: zipfile.ZipFile, kind: str, noun: str) -> None:

@@ -69,7 +69,6 @@ PAGE = Kind("a page", "give the file that it was made from")
 PYTHON = Kind("a Python file", "magtwin localize RUN --map MAP --method MODULE:CLASS takes a class in it")
 YAML = Kind("a YAML", "--controllers of magtwin robot and magtwin scene takes one with a robot's controllers")
 OCCUPANCY = Kind("an occupancy map of map_server", "give the scene that magtwin map occupancy made it from")
-ROS_1_BAG = Kind("a bag of ROS 1", "rosbags-convert --src {file} --dst FOLDER makes one of ROS 2 of it")
 BAG_YAML = Kind("the description of a bag", "give the folder that it is in")
 MESH = Kind("a mesh", "magtwin robot converts a URDF that names it")
 GAZEBO = Kind("a world or model of Gazebo", "give the URDF or the stage that it was made from")
@@ -294,11 +293,10 @@ _BY_SUFFIX: dict[str, Callable[[Path], Kind | None]] = {
     ".parquet": _kind_of_parquet,
     ".safetensors": _is(WEIGHTS),
     ".onnx": _is(ONNX),
-    ".bag": _is(ROS_1_BAG),
     ".py": _is(PYTHON),
     **dict.fromkeys((".urdf", ".xacro"), _is(URDF)),
     **dict.fromkeys(USD_SUFFIXES, _is(STAGE)),
-    **dict.fromkeys((".npz", ".rrd", ".mcap", ".db3"), _is(RUN)),
+    **dict.fromkeys((".npz", ".rrd", ".mcap", ".db3", ".bag"), _is(RUN)),
     **dict.fromkeys((".pth", ".pt"), _is(CHECKPOINT)),
     **dict.fromkeys((".png", ".jpg", ".jpeg", ".svg", ".gif", ".mp4", ".pgm"), _is(PICTURE)),
     **dict.fromkeys((".html", ".md"), _is(PAGE)),

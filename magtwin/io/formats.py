@@ -14,7 +14,9 @@ entry point:
 
 import importlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
@@ -80,6 +82,7 @@ DB3 = Format(
     reads=BAG.reads,
     instead=".mcap, the default of ROS 2; ros2 bag convert makes a .db3 of it",
 )
+ROS1 = Format(name="bag of ROS 1", read=BAG.read, reads=BAG.reads, instead=".mcap, the default of ROS 2")
 USD = Format(
     name="USD",
     read="magtwin.usd.animation:read_animation",
@@ -87,13 +90,36 @@ USD = Format(
     takes=frozenset(("scene_file", "fps")),
 )
 
+BAGS = (".mcap", ".db3", ".bag")
+"""Suffixes of storage files of bags."""
+
 _SUFFIXES = {".parquet": "PARQUET", ".csv": "CSV", ".npz": "NPZ", ".rrd": "RERUN", ".json": "RELEASE"}
-_SUFFIXES |= {".mcap": "BAG", ".db3": "DB3", ".usd": "USD", ".usda": "USD", ".usdc": "USD"}
+_SUFFIXES |= {".mcap": "BAG", ".db3": "DB3", ".bag": "ROS1", ".usd": "USD", ".usda": "USD", ".usdc": "USD"}
 
 FORMATS: Registry[Format] = Registry(
     "run format", "formats", {suffix: f"{__name__}:{name}" for suffix, name in _SUFFIXES.items()}
 )
 """Formats by suffix. A name without a suffix is a rosbag2 folder."""
+
+
+_TOLD: ContextVar[tuple[dict[str, Any], list[Path]] | None] = ContextVar("told", default=None)
+
+
+@contextmanager
+def recordings(**options: Any) -> Iterator[None]:
+    """Options for all robots' bags that `read_run` reads inside: `topics`, `unit` and `scale`.
+
+    Raises:
+        InputError: None was read.
+    """
+    used = list[Path]()
+    token = _TOLD.set((options, used))
+    try:
+        yield
+    finally:
+        _TOLD.reset(token)
+    if not used:
+        raise InputError(f"no robot's recording was read; drop the option {next(iter(options))!r}")
 
 
 def read_run(path: str | os.PathLike[str], **options: Any) -> Run:
@@ -113,6 +139,9 @@ def read_run(path: str | os.PathLike[str], **options: Any) -> Run:
     file, format_ = _in_folder(path) if path.is_dir() else (path, format_of(path))
     if unknown := sorted(options.keys() - format_.reads):
         raise InputError(f"{path}: {format_.name} has no option {unknown[0]!r}; drop it")
+    if (told := _TOLD.get()) is not None and "topics" in format_.reads:
+        options = told[0] | options
+        told[1].append(file)
     run = _function(format_.read)(file, **options)
     check_clock(run, str(path))
     check_size_of_numbers(run, str(path))
@@ -230,9 +259,16 @@ def _holds_one(folder: Path) -> bool:
     return (folder / "metadata.yaml").is_file() or (folder / "run.parquet").is_file()
 
 
+def is_bag(path: Path) -> bool:
+    """Whether a path is a bag: a storage file, or a folder that holds one."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file() or any(p.suffix.lower() in BAGS for p in path.iterdir())
+    return path.suffix.lower() in BAGS
+
+
 def _in_folder(folder: Path) -> tuple[Path, Format]:
     """The file to read in a folder, and its format."""
-    if (folder / "metadata.yaml").exists() or any(folder.glob("*.db3")) or any(folder.glob("*.mcap")):
+    if is_bag(folder):
         return folder, BAG
     if (folder / "run.parquet").is_file():
         return folder / "run.parquet", PARQUET

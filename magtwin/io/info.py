@@ -11,7 +11,7 @@ from magtwin.field.maps.statistics import map_metadata
 from magtwin.field.survey.nodes import read_survey
 from magtwin.files.file import existing
 from magtwin.files.kinds import kind_of, shipped_or
-from magtwin.io.formats import FORMATS, read_run
+from magtwin.io.formats import FORMATS, is_bag, read_run
 from magtwin.io.surveys.logs import is_survey
 from magtwin.report.report import Figure, Report
 
@@ -31,6 +31,10 @@ def info_of(path: str | os.PathLike[str], **reading: Any) -> Report:
         InputError: The file is missing, of an unknown kind, or damaged.
     """
     file = existing(shipped_or(Path(path)), "file")
+    if is_bag(file):
+        from magtwin.io.recording.contents import info_of_bag
+
+        return info_of_bag(file, **reading)
     if file.is_dir() and not is_survey(file):
         return (
             map_metadata(read_survey(file)[0])

@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -11,9 +12,10 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.frames import quat_conjugate, quat_multiply, rotate
 from magtwin.io.bags.cdr import NS
-from magtwin.io.bags.frames import LEAVES, Mount, Role, StaticFrames, in_base, mount_of, role_of
-from magtwin.io.bags.topics import LATCHED, SENSOR_DATA, TF_STATIC, Topic
+from magtwin.io.bags.topics import DESCRIPTION, LATCHED, SENSOR_DATA, TF_STATIC, Topic
 from magtwin.io.bags.types import layout
+from magtwin.io.recording.frames import LEAVES, Mount, StaticFrames, in_base, mount_of
+from magtwin.io.recording.roles import Role, role_of
 from magtwin.ros.bus import Bus, Message, Subscription
 from magtwin.ros.diagnostics import Level, Problems, Status, status_of
 from magtwin.spec.base import Quat
@@ -56,7 +58,7 @@ STATICS = 100
 
 
 class LiveFrames:
-    """The frames of a robot, by /tf_static."""
+    """The frames of a robot, by /tf_static, and by its description where that has none."""
 
     def __init__(self, bus: Bus, axes: Mapping[str, Quat] | None = None) -> None:
         """Listen.
@@ -69,6 +71,8 @@ class LiveFrames:
         self._mounts: dict[tuple[str, ...], tuple[Mount | None, str]] = {}
         if bus.knows(TF_STATIC.kind):
             bus.subscribe(TF_STATIC.name, TF_STATIC.kind, self._hear, replace(LATCHED, depth=STATICS))
+        if bus.knows(DESCRIPTION.kind):
+            bus.subscribe(DESCRIPTION.name, DESCRIPTION.kind, self._described, LATCHED)
 
     def in_base(self, role: Role, frames: tuple[str, str], columns: Columns) -> tuple[Columns, str]:
         """Columns of a message in these frames as those of base_link; and what is wrong with the frames."""
@@ -81,6 +85,11 @@ class LiveFrames:
             q = mount.q_xyzw if wanted is None else quat_multiply(quat_conjugate(wanted), mount.q_xyzw)
             columns = in_base(role, columns, mount._replace(q_xyzw=q))
         return columns, fault
+
+    def _described(self, message: Message) -> None:
+        with suppress(InputError):
+            self._known.describe(str(message.read(["data"])["data"]))
+        self._mounts.clear()
 
     def _hear(self, message: Message) -> None:
         parts = ("header.frame_id", "child_frame_id", "transform.translation", "transform.rotation")

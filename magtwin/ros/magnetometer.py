@@ -20,6 +20,7 @@ from magtwin.frames import yaw_from_quat
 from magtwin.io.bags.cdr import NS
 from magtwin.io.bags.sender import prefixed, sender_of
 from magtwin.io.bags.topics import BATTERY, COMMAND, IMU, MAGNITUDE, ODOMETRY, POSE, Topic
+from magtwin.learn.data.inputs import MANY
 from magtwin.ros.bus import Bus, to_bytes
 from magtwin.ros.bus.names import checked_prefix
 from magtwin.ros.diagnostics import Status
@@ -127,7 +128,7 @@ class Magnetometer:
             outputs = [replace(topic, name=topic.name.replace("/qtfm/", "/predicted/")) for topic in outputs]
         self._outputs = [(bus.publisher(topic.name, topic.kind, topic.qos), topic) for topic in outputs]
         self._last_ns, self._begun_ns = 0, 0
-        self._outside, self._strange = 0, 0
+        self._outside, self._strange, self._given = 0, 0, 0
         self._reader: Reader | None = None  # None: the map alone
         self._pose_late_ns = 0
         if twin.magnetometer is not None:
@@ -202,6 +203,7 @@ class Magnetometer:
             self._skip("the pose is outside the map")
             return
         self._strange += reading.outside_training
+        self._given += 1
         if not np.isfinite(reading.b_total_nt):
             self._skip("the network gave no number")
             return
@@ -280,7 +282,10 @@ class Magnetometer:
                 f"{rate or 0:.0f} readings a second in place of {wanted:g}",
             ),
             (self._outside, f"{self._outside} poses were outside the map"),
-            (self._strange, f"{self._strange} readings were outside the network's training range"),
+            (
+                self._strange > MANY * self._given,
+                f"{self._strange} of {self._given} readings were outside the network's training range",
+            ),
             (others > 0, f"{others} others publish {magnitude.topic} too"),
         )
         values = {
@@ -289,7 +294,7 @@ class Magnetometer:
             "out of distribution": str(self._strange),
             "units": self._sender.unit,
         }
-        self._outside = self._strange = 0
+        self._outside = self._strange = self._given = 0
         return [self._node.status("readings", "reading", silent, problems, values)]
 
 

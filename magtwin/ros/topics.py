@@ -10,11 +10,12 @@ from magtwin.io.bags.topics import (
     CLOCK,
     COMMAND,
     DESCRIPTION,
+    FIELD,
     IMU,
     JOINTS,
-    LATCHED,
     MAGNITUDE,
     NAMES,
+    OCCUPANCY,
     ODOMETRY,
     POSE,
     READING,
@@ -68,8 +69,6 @@ SAMPLED: Mapping[str, Topic] = {"odometry": ODOMETRY, "imu": IMU, "mocap": POSE,
 READ = (TICKS, JOINTS, TF, TRUTH, MAGNITUDE, VECTOR, TOTAL_FIELD)
 """Topics that are sent at readings of the magnetometer."""
 
-OCCUPANCY = Topic(name="/map", kind="nav_msgs/msg/OccupancyGrid", qos=LATCHED, sent="once")
-FIELD = Topic(name="/anomaly_map", kind="sensor_msgs/msg/PointCloud2", qos=LATCHED, sent="once")
 READINGS = Topic(name="/robot/ground_truth/readings", kind="sensor_msgs/msg/PointCloud2")
 PATH = Topic(name="/robot/ground_truth/path", kind="nav_msgs/msg/Path", qos=Qos(depth=1))
 

@@ -278,7 +278,10 @@ def localization(
         rate_hz=rate_hz or (run.rows - 1) / max(run.duration_s, 1e-9),
         seed=seed,
     )
-    (x, y, _), (x0, x1, y0, y1) = problem.prior.mean, problem.extent
+    (x, y, yaw), (x0, x1, y0, y1) = problem.prior.mean, problem.extent
+    if prior in (None, "tracking"):  # whose error may lie beyond the edge of the map
+        x, y = min(max(x, x0), x1), min(max(y, y0), y1)
+        problem = replace(problem, prior=replace(problem.prior, mean=(x, y, yaw)))
     if not problem.prior.is_global and not (x0 <= x <= x1 and y0 <= y <= y1):
         text = f"{x:g}, {y:g} m is off the floor, x {x0:g} to {x1:g} m, y {y0:g} to {y1:g} m"
         raise InputError(f"the `prior` x, y = {text}", parameter="prior")

@@ -36,7 +36,7 @@ TAKES = {
     "mesh.stl": "magtwin robot",
     "world.sdf": "give the URDF or the stage",
     "data.zip": "unpack it",
-    "drive.bag": "rosbags-convert --src drive.bag",
+    "drive.bag": "magtwin info drive.bag",
 }
 """What the refusal of each file names."""
 
@@ -47,10 +47,10 @@ RARE |= {"data.zip", "drive.bag"}
 FEW = ("run FILE", "scene FILE --out new", "robot FILE --out new", "info FILE")
 """Those commands."""
 
-RUNS = {"run.npz", "run.parquet", "run.csv", "map.usdc", "model.json"}
+RUNS = {"run.npz", "run.parquet", "run.csv", "map.usdc", "model.json", "drive.bag"}
 """Files that a reader of runs opens: stages and JSON may hold one."""
 
-TABLES = {"run.npz", "run.parquet", "run.csv", "commands.csv", "path.csv"}
+TABLES = {"run.npz", "run.parquet", "run.csv", "commands.csv", "path.csv", "drive.bag"}
 SLOTS = {
     "run FILE": {"map.usdc", "room", "cart"},
     "sweep FILE --out new": {"map.usdc", "room", "cart"},

@@ -10,11 +10,15 @@ from scipy.spatial.transform import Rotation
 
 from magtwin.errors import MismatchWarning, RepairWarning
 from magtwin.io.bags import read_bag
-from magtwin.io.bags.frames import StaticFrames
+from magtwin.io.recording.frames import StaticFrames
 from magtwin.io.surveys.readings import read_readings
 from magtwin.run.run import Run
 from magtwin.tasks.localizing import check_lever_arm
 
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:.*by its size.*:magtwin.errors.RepairWarning"),
+    pytest.mark.filterwarnings("ignore:.* joins .*:magtwin.errors.RepairWarning"),
+]
 GRAVITY = np.array([0.0, 0.0, 9.80665])
 FIELD = np.array([12_000.0, 20_000.0, -38_000.0])
 RATE, AHEAD = np.array([0.0, 0.0, 0.2]), np.array([0.0, 0.04, 0.0])
@@ -87,10 +91,15 @@ def test_an_orientation_that_gravity_shows_to_be_that_of_the_base_is_kept(tmp_pa
 
 
 def test_without_a_transform_a_sensor_is_taken_as_upright_and_that_is_told(tmp_path):
-    run, readings = both(record(tmp_path / "a.mcap", drive()))
-    text = "field of /mag in the axes of 'sensor_link' as in those of base_link"
-    assert text in run.metadata["taken"]
-    assert f"taken {text}" in readings.source
+    bag, text = (
+        record(tmp_path / "a.mcap", drive()),
+        "joins 'sensor_link' to base_link: vectors of /mag{} are",
+    )
+    with pytest.warns(RepairWarning, match=text.format(", /imu")) as told:
+        read_bag(bag, topics=PLACED)
+    assert len(told) == 1
+    with pytest.warns(RepairWarning, match=text.format("")):
+        read_readings(bag, pose_topic="/pose")
     run, readings = both(record(tmp_path / "b.mcap", drive(frame="")))
     assert run.metadata["taken"] == "field /mag, IMU /imu by their types"
     assert readings.source.endswith("; taken field /mag by its type")
@@ -122,7 +131,7 @@ def test_pose_and_velocity_of_a_camera_become_those_of_the_base(tmp_path, root):
 
 def test_the_pose_of_a_camera_whose_place_is_unknown_is_warned_of(tmp_path):
     bag = record(tmp_path / "a.mcap", drive(child="camera_link"))
-    with pytest.warns(RepairWarning, match="it is the pose of 'camera_link', and no /tf_static has the way"):
+    with pytest.warns(RepairWarning, match="pose of 'camera_link', and no tree of frames has the way"):
         read_readings(bag, pose_topic="/pose")
 
 

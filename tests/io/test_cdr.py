@@ -11,7 +11,9 @@ from magtwin.io.bags.topics import TOPICS
 from magtwin.io.bags.types import layout
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
-KINDS = sorted({kind for topic in TOPICS.values() for kind in (topic.kind, *topic.reads)})
+KINDS = sorted(
+    {kind for topic in TOPICS.values() for kind in (topic.kind, *topic.reads) if kind in STORE.fielddefs}
+)
 DIAGNOSTICS = {"status": 2, "status.0.values": 0, "status.1.values": 2}
 FORMS = [(kind, {}) for kind in KINDS]
 FORMS += [("tf2_msgs/msg/TFMessage", {"transforms": n}) for n in (1, 3)]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Flag, Force, Names, Seed, pairs
+from magtwin.cli.options import Flag, Force, Names, Seed, pairs, reads_recordings
 from magtwin.cli.terminal import Done, progress, step, width
 from magtwin.errors import InputError
 from magtwin.report.summary import aligned, clipped
@@ -23,6 +23,7 @@ MOST_CASES = 7
 
 
 @app.command
+@reads_recordings
 def evaluate(
     *weights: Annotated[Path, Parameter(required=True)],
     out: Path,

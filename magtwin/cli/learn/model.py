@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Flag, Force, Licence
+from magtwin.cli.options import Flag, Force, Licence, reads_recordings
 from magtwin.cli.terminal import Done, named, step
 
 model_app = App(name="model", help="Convert, export and calibrate networks; compensate the platform's field.")
@@ -91,6 +91,7 @@ def widen(
 
 
 @model_app.command
+@reads_recordings
 def calibrate(
     weights: Path,
     run: Path,

@@ -6,7 +6,15 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import RECORDED, Force, OutUnit, RecordedOptions, RunScene, UsdFps
+from magtwin.cli.options import (
+    RECORDED,
+    Force,
+    OutUnit,
+    RecordedOptions,
+    RunScene,
+    UsdFps,
+    reads_recordings,
+)
 from magtwin.cli.terminal import Done, progress, silence, step
 
 
@@ -17,9 +25,10 @@ def info(file: Path, *, recorded: RecordedOptions = RECORDED) -> Done:
     Parameters
     ----------
     file
-        A run (.parquet, .rrd, .mcap, .db3, .csv, .npz, .usd, a .json of the released node, or the folder of a
-        bag, of Parquet parts, or of magtwin run), a stage or a map (.usd, .usda, .usdc, .usdz), a folder of
-        survey CSVs (0_map.csv, ...), or a network (.safetensors, .pth, .onnx).
+        A run (.parquet, .rrd, .mcap, .db3, .bag, .csv, .npz, .usd, a .json of the released node, the folder
+        of a bag, of Parquet parts, or of magtwin run), a stage or a map (.usd, .usda, .usdc, .usdz), a
+        survey (a table, the log of a phone or vehicle, a folder of 0_map.csv, ...), or a network
+        (.safetensors, .pth, .onnx).
     """
     from magtwin.io.info import info_of
 
@@ -28,6 +37,7 @@ def info(file: Path, *, recorded: RecordedOptions = RECORDED) -> Done:
 
 
 @app.command
+@reads_recordings
 def view(
     *files: Annotated[Path, Parameter(required=True)],
     scene: RunScene = None,

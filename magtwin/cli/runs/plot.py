@@ -6,12 +6,13 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, RunScene, headings_rad
+from magtwin.cli.options import Force, RunScene, headings_rad, reads_recordings
 from magtwin.cli.terminal import Done, note, progress
 from magtwin.errors import InputError
 
 
 @app.command
+@reads_recordings
 def plot(
     *files: Annotated[Path, Parameter(required=True)],
     out: Path | None = None,

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, RunScene
+from magtwin.cli.options import Force, RunScene, reads_recordings
 from magtwin.cli.terminal import Done, named, progress, step
 from magtwin.report.summary import aligned
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 
 @app.command
+@reads_recordings
 def report(
     *runs: Annotated[Path, Parameter(required=True)],
     out: Path | None = None,
@@ -43,6 +44,7 @@ def report(
 
 
 @app.command
+@reads_recordings
 def compare(
     a: Path,
     b: Path,

@@ -10,7 +10,7 @@ from typing import Any
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force, Network, pairs
-from magtwin.cli.terminal import Done, named, progress, step
+from magtwin.cli.terminal import Done, named, note, progress, step
 from magtwin.errors import InputError
 
 FIGURES = ("size", "prims", "rigid bodies", "mass")
@@ -48,7 +48,7 @@ def new(out: Path, *, plan: Path | None = None, scale: float | None = None, forc
         return Done(wrote=out, next=(*folder, drive, try_it))
     from magtwin.twin import new_scene
 
-    new_scene(out, plan=plan, scale=scale, report=announce, force=force)
+    new_scene(out, plan=plan, scale=scale, report=note, force=force)
     room = out.with_suffix("")
     author = ("magtwin", "scene", out, "--out", room)
     return Done(wrote=out, next=(author, ("magtwin", "run", room / f"{out.stem}.usda")))

@@ -1,6 +1,6 @@
 """Bags: rosbag2, read and written without ROS.
 
-Messages are decoded with the type definitions of rosbags, never with those that a bag contains.
+Messages are decoded with the type definitions of rosbags; those in a bag are used for types that it lacks.
 """
 
 import importlib

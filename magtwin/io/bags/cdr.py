@@ -10,8 +10,8 @@ then each number at a multiple of its size (OMG formal/2002-06-51, section 15.3)
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +65,9 @@ class Messages:
     size: Index
     """Bytes of each, shape (M,)."""
 
+    packed: bool = False
+    """Whether they are those of ROS 1: without a header of four bytes, and without padding."""
+
     def __len__(self) -> int:
         return len(self.received)
 
@@ -76,7 +79,7 @@ class Messages:
 
     def take(self, rows: NDArray[np.intp]) -> "Messages":
         """Some of the messages, by index."""
-        return Messages(self.received[rows], self.buffer, self.start[rows], self.size[rows])
+        return replace(self, received=self.received[rows], start=self.start[rows], size=self.size[rows])
 
 
 def encode(leaves: Sequence[Leaf], fields: Mapping[str, Any], rows: int, *, room: int = 0) -> Bytes:
@@ -158,93 +161,115 @@ def decode(leaves: Sequence[Leaf], messages: Messages, wanted: Iterable[str]) ->
         InputError: A message is too short for its type, or has another encoding.
     """
     left, values_of = set(wanted), {}
-    body, room = messages.start + HEADER, messages.size - HEADER
-    if np.any(room < 0):
+    head = 0 if messages.packed else HEADER
+    raw = _Raw(messages.buffer, messages.start + head, messages.size - head, messages.packed)
+    if np.any(raw.room < 0):
         raise InputError("a message of less than 4 bytes")
-    if np.any(messages.buffer[messages.start + 1] != 1) or np.any(messages.buffer[messages.start] != 0):
+    first = messages.start
+    if head and (np.any(messages.buffer[first + 1] != 1) or np.any(messages.buffer[first] != 0)):
         raise InputError("messages are not plain little-endian CDR")
     at = np.zeros(len(messages), np.int64)
     for leaf in leaves:
         if not left:
             break
         if leaf.kind == "text":
-            values, at = _texts(leaf, messages.buffer, body, room, at, leaf.name in left)
+            values, at = _texts(leaf, raw, at, leaf.name in left)
         elif leaf.kind == "none":
-            count, at = _numbers("u4", 1, messages.buffer, body, room, at)
+            count, at = _numbers("u4", 1, raw, at)
             if np.any(count):
                 raise InputError(f"sequence {leaf.name} is not empty, which is not supported")
             continue
         else:
-            values, at = _leaf(leaf, messages.buffer, body, room, at, leaf.name in left)
+            values, at = _leaf(leaf, raw, at, leaf.name in left)
         if leaf.name in left:
             values_of[leaf.name] = values
             left.discard(leaf.name)
     return values_of
 
 
+class _Raw(NamedTuple):
+    """Bytes of messages, without their headers."""
+
+    buffer: Bytes
+    body: Index
+    """Offset of the first leaf of each message."""
+
+    room: Index
+    """Bytes of each from there on."""
+
+    packed: bool
+
+    def aligned(self, at: Any, size: int) -> Any:
+        """Offsets from which a number of a size is stored."""
+        return at if self.packed else _aligned(at, size)
+
+    def rows(self, rows: NDArray[np.intp]) -> "_Raw":
+        """Some of the messages."""
+        return self._replace(body=self.body[rows], room=self.room[rows])
+
+
 def _aligned(at: Any, size: int) -> Any:
     return (at + size - 1) & -size
 
 
-def _numbers(kind: str, count: int, buffer: Bytes, body: Index, room: Index, at: Index) -> tuple[Any, Index]:
+def _numbers(kind: str, count: int, raw: _Raw, at: Index) -> tuple[Any, Index]:
     """`count` numbers of each message, shape (M, count), and the offset behind them."""
     dtype = np.dtype(kind).newbyteorder("<")
-    at = _aligned(at, dtype.itemsize)
+    at = raw.aligned(at, dtype.itemsize)
     need = dtype.itemsize * count
-    if np.any(at + need > room):
+    if np.any(at + need > raw.room):
         raise InputError("a message ends before its last number")
     if not count or not len(at):
         return np.zeros((len(at), count), dtype), at
-    windows = np.ndarray((len(buffer) - need + 1, count), dtype, buffer, 0, (1, dtype.itemsize))
-    return windows[body + at], at + need
+    shape = (len(raw.buffer) - need + 1, count)
+    return np.ndarray(shape, dtype, raw.buffer, 0, (1, dtype.itemsize))[raw.body + at], at + need
 
 
-def _leaf(leaf: Leaf, buffer: Bytes, body: Index, room: Index, at: Index, wanted: bool) -> tuple[Any, Index]:
+def _leaf(leaf: Leaf, raw: _Raw, at: Index, wanted: bool) -> tuple[Any, Index]:
     """Numbers or stamps of a leaf, and the offset behind them."""
     if leaf.kind == "time":
-        parts, at = _numbers("u4", 2, buffer, body, room, at)
+        parts, at = _numbers("u4", 2, raw, at)
         return parts[:, 0].astype(np.int32).astype(np.int64) * NS + parts[:, 1], at
     if leaf.count is not None:
-        values, at = _numbers(leaf.kind, leaf.count, buffer, body, room, at)
+        values, at = _numbers(leaf.kind, leaf.count, raw, at)
         return (values[:, 0] if leaf.count == 1 else values), at
-    counts, at = _numbers("u4", 1, buffer, body, room, at)
+    counts, at = _numbers("u4", 1, raw, at)
     count, size = counts[:, 0].astype(np.int64), np.dtype(leaf.kind).itemsize
-    begins = np.where(count > 0, _aligned(at, size), at)  # an empty sequence has no padding
-    if np.any(begins + count * size > room):
+    begins = np.where(count > 0, raw.aligned(at, size), at)  # an empty sequence has no padding
+    if np.any(begins + count * size > raw.room):
         raise InputError(f"a message ends before the end of its {leaf.name}")
     if not wanted or not np.any(count):
         return np.zeros((len(count), 0)), begins + count * size
     most = int(count.max())
     if np.all(count == most):
-        return _numbers(leaf.kind, most, buffer, body, room, at)
-    if most * size * len(count) > MOST_PADDING * len(buffer):
+        return _numbers(leaf.kind, most, raw, at)
+    if most * size * len(count) > MOST_PADDING * len(raw.buffer):
         raise InputError(f"lengths of {leaf.name} differ too much between messages")
     values = np.full((len(count), most), np.nan)
     for n in np.unique(count):
         rows = np.flatnonzero(count == n)
-        values[rows, :n], _ = _numbers(leaf.kind, int(n), buffer, body[rows], room[rows], at[rows])
+        values[rows, :n], _ = _numbers(leaf.kind, int(n), raw.rows(rows), at[rows])
     return values, begins + count * size
 
 
-def _texts(
-    leaf: Leaf, buffer: Bytes, body: Index, room: Index, at: Index, wanted: bool
-) -> tuple[list[Any], Index]:
+def _texts(leaf: Leaf, raw: _Raw, at: Index, wanted: bool) -> tuple[list[Any], Index]:
     """Strings of a leaf if wanted, and the offset behind them."""
     if leaf.count:
-        begins, at = _text(leaf, buffer, body, room, at)
-        return _strings(buffer, body + begins, body + at) if wanted else [], at
-    counts, at = _numbers("u4", 1, buffer, body, room, at)
+        begins, at = _text(leaf, raw, at)
+        return _strings(raw.buffer, raw.body + begins, raw.body + at) if wanted else [], at
+    counts, at = _numbers("u4", 1, raw, at)
     count = counts[:, 0].astype(np.int64)
     most = int(count.max(initial=0))
-    if most > MOST_TEXTS or np.any(count * 4 > room):
+    if most > MOST_TEXTS or np.any(count * 4 > raw.room):
         raise InputError(f"{leaf.name} of a message has {most} strings")
     words: list[list[str]] = [[] for _ in count]
     for k in range(most):
         rows = np.flatnonzero(count > k)
-        begins, after = _text(leaf, buffer, body[rows], room[rows], at[rows])
+        some = raw.rows(rows)
+        begins, after = _text(leaf, some, at[rows])
         if wanted:
             for row, word in zip(
-                rows, _strings(buffer, body[rows] + begins, body[rows] + after), strict=True
+                rows, _strings(raw.buffer, some.body + begins, some.body + after), strict=True
             ):
                 words[row].append(word)
         at = at.copy()
@@ -252,11 +277,11 @@ def _texts(
     return [tuple(w) for w in words], at
 
 
-def _text(leaf: Leaf, buffer: Bytes, body: Index, room: Index, at: Index) -> tuple[Index, Index]:
+def _text(leaf: Leaf, raw: _Raw, at: Index) -> tuple[Index, Index]:
     """Offsets of a string and of the byte behind it."""
-    lengths, at = _numbers("u4", 1, buffer, body, room, at)
+    lengths, at = _numbers("u4", 1, raw, at)
     after = at + lengths[:, 0].astype(np.int64)
-    if np.any(after > room):
+    if np.any(after > raw.room):
         raise InputError(f"a message ends within its {leaf.name}")
     return at, after
 

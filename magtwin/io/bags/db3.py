@@ -12,7 +12,7 @@ import yaml
 from magtwin.errors import InputError
 from magtwin.files.budget import BUDGETS, check_decoded
 from magtwin.files.settings import yaml_loader
-from magtwin.io.bags.cdr import Messages
+from magtwin.io.bags.cdr import Index, Messages
 from magtwin.io.bags.storage import StoredTopic
 
 _STEPS, _STEP = 1_000_000, 10_000
@@ -25,18 +25,22 @@ damaged file can lead to each other again and again."""
 _ROWS = 10_000
 """Most topics of a bag."""
 
+MOST_QOS = 4_000
+"""Characters of the quality of service of a topic that are read."""
+
 
 class Db3Reader:
     """A .db3 file: its topics, its metadata, and its messages on demand.
 
-    The quality of service of its topics is not read, as its YAML can be large.
-
     Attributes:
         topics: Its topics.
         notes: The custom data that a .db3 file holds.
+        definitions: Encoding and text of the definition of each message type, as far as it holds them.
     """
 
-    whole = True
+    whole, chunks = True, 0
+    compression = frozenset[str]()
+    damaged = frozenset[int]()
 
     def __init__(self, path: Path) -> None:
         self._path, self._size, self._steps = path, path.stat().st_size, 0
@@ -47,6 +51,7 @@ class Db3Reader:
             tables = _tables(self._database)
             self.notes = _custom_data(self._database) if "metadata" in tables else {}
             self.topics = _topics(self._database)
+            self.definitions = _definitions(self._database)
             self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, longest)
         except BaseException:
             self.close()
@@ -56,8 +61,16 @@ class Db3Reader:
         """Close the bag."""
         self._database.close()
 
-    def messages(self, ids: Collection[int]) -> dict[int, Messages]:
-        """The messages of some topics in the order of receipt."""
+    def times(self) -> dict[int, Index]:
+        """Times of receipt of the messages of each topic [ns]."""
+        found = {topic.id: array("q") for topic in self.topics}
+        self._steps = 0
+        for number, received in self._database.execute("SELECT topic_id, timestamp FROM messages"):
+            found.setdefault(number, array("q")).append(received)
+        return {number: np.sort(np.array(times, np.int64)) for number, times in found.items()}
+
+    def messages(self, ids: Collection[int], most: int | None = None) -> dict[int, Messages]:
+        """The messages of some topics in the order of receipt; of about the first `most` bytes."""
         found = {number: (array("q"), array("q"), bytearray()) for number in ids}
         query = (
             f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({', '.join('?' * len(ids))})"
@@ -66,6 +79,8 @@ class Db3Reader:
         for number, received, data in self._database.execute(query, list(ids)):
             times, sizes, contents = found[number]
             held += len(data)  # rows of a damaged file can share their pages
+            if most is not None and held > most:
+                break
             check_decoded(self._path, self._size, held)
             times.append(received)
             sizes.append(len(data))
@@ -104,9 +119,9 @@ def _tables(database: sqlite3.Connection) -> set[str]:
 
 def _topics(database: sqlite3.Connection) -> list[StoredTopic]:
     """Its topics."""
-    columns = (
-        "CAST(id AS INTEGER), CAST(name AS TEXT), CAST(type AS TEXT), CAST(serialization_format AS TEXT)"
-    )
+    qos = "offered_qos_profiles" if "offered_qos_profiles" in _columns(database, "topics") else "''"
+    columns = "CAST(id AS INTEGER), CAST(name AS TEXT), CAST(type AS TEXT), "
+    columns += f"CAST(serialization_format AS TEXT), substr(CAST({qos} AS TEXT), 1, {MOST_QOS})"
     topics, held = [], 0
     for number, *texts in database.execute(f"SELECT {columns} FROM topics WHERE id IS NOT NULL"):
         topics.append(StoredTopic(number, *(text or "" for text in texts)))
@@ -114,6 +129,20 @@ def _topics(database: sqlite3.Connection) -> list[StoredTopic]:
         if len(topics) > _ROWS or held > BUDGETS["text"].file:
             raise InputError(f"it has over {_ROWS:,} topics, or they are too long; write it again with fewer")
     return sorted(topics)
+
+
+def _columns(database: sqlite3.Connection, table: str) -> set[str]:
+    """Names of the columns of a table; empty if there is none."""
+    return {str(name) for (name,) in database.execute("SELECT name FROM pragma_table_info(?)", (table,))}
+
+
+def _definitions(database: sqlite3.Connection) -> dict[str, tuple[str, str]]:
+    """Encoding and text of the definition of each message type, which ROS 2 Iron and later store."""
+    names = "topic_type", "encoding", "encoded_message_definition"
+    if not _columns(database, "message_definitions").issuperset(names):
+        return {}
+    rows = database.execute(f"SELECT {', '.join(names)} FROM message_definitions LIMIT {_ROWS}")
+    return {str(kind): (str(encoding), str(text)) for kind, encoding, text in rows}
 
 
 def _custom_data(database: sqlite3.Connection) -> dict[str, str]:

@@ -19,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 from mcap import records
 from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
@@ -43,6 +44,15 @@ SPARE = 1 << 26
 
 LEVEL = 1
 """Compression level of zstd."""
+
+FOOTER = 29
+"""Bytes of the record that ends a file."""
+
+PRIVATE = 0x80
+"""Opcodes from which a record is of no concern."""
+
+_DAMAGED = (ValueError, struct.error, McapError, IndexError, OverflowError)
+"""What the library raises for a damaged record."""
 
 _HEAD = struct.Struct("<BQ")
 _RECORD = struct.Struct("<BQH")
@@ -140,9 +150,14 @@ class McapWriter:
 
     def _cut(self, batches: Sequence[Batch]) -> Iterator[tuple[Index, Bytes, dict[int, Any]]]:
         """Chunks of messages in the order of their times: times, content, and the index by channel."""
-        for batch in batches:
-            _fill_heads(batch)
         times, which = in_time(batches)
+        ids = [batch.connection.id for batch in batches]
+        for k, batch in enumerate(batches):
+            rank = np.arange(len(batch.received))
+            if ids.count(ids[k]) > 1:  # a topic of several sizes, whose messages are numbered in time
+                same = np.flatnonzero(np.array(ids)[which] == ids[k])
+                rank = np.searchsorted(same, np.flatnonzero(which == k))
+            _fill_heads(batch, self.counts[ids[k]] + rank)
         sizes = np.array([b.rows.shape[1] for b in batches], np.int64)[which]
         ends = np.cumsum(sizes)
         done = [0] * len(batches)
@@ -196,13 +211,14 @@ class McapWriter:
         )
 
 
-def _fill_heads(batch: Batch) -> None:
+def _fill_heads(batch: Batch, sequence: NDArray[np.intp]) -> None:
     """Make each row a message record: opcode, length, channel, sequence, and the time twice."""
     count, width = batch.rows.shape
     formats = ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"]
     heads = np.zeros(count, np.dtype({"names": list("olcstp"), "formats": formats}))
     heads["o"], heads["l"], heads["c"] = Opcode.MESSAGE, width - _HEAD.size, batch.connection.id
     heads["t"] = heads["p"] = batch.received
+    heads["s"] = sequence
     batch.rows[:, :ROOM] = heads.view(np.uint8).reshape(count, ROOM)
 
 
@@ -215,35 +231,57 @@ def _windows(content: Bytes, kind: str) -> NDArray[Any]:
 class McapReader:
     """An MCAP file: its topics, its metadata, and its messages on demand.
 
+    A damaged record costs itself, and a damaged chunk its messages: records are walked through from the
+    beginning, and from a damaged one on by the index at the end of the file.
+
     Attributes:
         topics: Its channels.
         notes: Metadata records by name; the last one if several have the same name.
+        definitions: Encoding and text of the definition of each message type.
         whole: Whether the file has its end.
+        chunks: Number of its chunks.
+        compression: Names of their compressions.
+        damaged: Places of what could not be read so far.
     """
 
     def __init__(self, path: Path) -> None:
         self._file: BinaryIO = open(path, "rb")  # noqa: SIM115
         self._path, self._size = path, path.stat().st_size
         self.notes: dict[str, dict[str, str]] = {}
+        self.definitions: dict[str, tuple[str, str]] = {}
         self.whole = False
+        self.damaged: set[int] = set()
+        self.compression: set[str] = set()
         self._noted = 0
         self._spare = SPARE
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, records.Channel] = {}
-        self._chunks: list[tuple[int, int]] = []
+        self._chunks: dict[int, int] = {}  # place and length
+        self._indexes = array("q")  # place and length of indexes of messages, and the place of their chunk
+        self._spans: dict[int, tuple[int, int]] = {}  # first and last time of each chunk
         self._loose = array("q")  # channel, time of receipt, place and size of messages outside of chunks
         try:
-            if self._file.read(len(MAGIC)) != MAGIC:
+            same = sum(a == b for a, b in zip(self._file.read(len(MAGIC)), MAGIC, strict=False))
+            if same < len(MAGIC) - 1:
                 raise InputError("it does not begin like MCAP")
-            self._scan()
-            if not (self.whole and self._channels):
-                for chunk in self._chunks:
-                    self._walk(self._content(*chunk), ())
+            summary, sound = self._summary()
+            self._scan(len(MAGIC), summary or self._size)
+            if not (sound and self._channels):
+                for place in self._chunks:
+                    if (content := self._content(place)) is not None:
+                        self._walk(content, (), place)
         except BaseException:
             self.close()
             raise
+        self.chunks = len(self._chunks)
         self.topics = [
-            StoredTopic(c.id, c.topic, self._schemas.get(c.schema_id, ""), c.message_encoding)
+            StoredTopic(
+                c.id,
+                c.topic,
+                self._schemas.get(c.schema_id, ""),
+                c.message_encoding,
+                c.metadata.get("offered_qos_profiles", ""),
+            )
             for c in self._channels.values()
         ]
 
@@ -251,8 +289,27 @@ class McapReader:
         """Close the file."""
         self._file.close()
 
-    def messages(self, ids: Collection[int]) -> dict[int, Messages]:
-        """The messages of some topics in the order of receipt."""
+    def times(self) -> dict[int, Index]:
+        """Times of receipt of the messages of each topic [ns], from the indexes of messages."""
+        parts: dict[int, list[Index]] = {topic.id: [] for topic in self.topics}
+        loose = np.array(self._loose, np.int64).reshape(-1, 4)
+        for channel in np.unique(loose[:, 0]).tolist():
+            parts.setdefault(channel, []).append(loose[loose[:, 0] == channel, 1])
+        if len(self._indexes):
+            for place, length, chunk in np.array(self._indexes, np.int64).reshape(-1, 3).tolist():
+                raw = self._at(place, length)
+                entries = np.frombuffer(raw, "<i8", (len(raw) - 6) // 16 * 2, 6) if len(raw) > 6 else ()
+                times = np.asarray(entries, np.int64)[::2]
+                times = np.clip(times, *self._spans[chunk]) if chunk in self._spans else times
+                parts.setdefault(int.from_bytes(raw[:2], "little"), []).append(times)
+        elif self._chunks:
+            for number, messages in self.messages(parts.keys()).items():
+                parts[number] = [messages.received]
+        none = np.zeros(0, np.int64)
+        return {number: np.sort(np.concatenate([none, *found])) for number, found in parts.items()}
+
+    def messages(self, ids: Collection[int], most: int | None = None) -> dict[int, Messages]:
+        """The messages of some topics in the order of receipt; of chunks of at most `most` bytes in all."""
         self._spare = SPARE
         parts: list[tuple[Bytes, Any]] = []
         held = 0
@@ -263,10 +320,16 @@ class McapReader:
                 raw += self._at(place, size)
             loose[:, 2] = np.cumsum(loose[:, 3]) - loose[:, 3]
             parts.append((np.frombuffer(raw, np.uint8), loose))
-        for chunk in self._chunks:
-            content = self._content(*chunk)
-            found = self._walk(content, ids)
+        spent = 0
+        for place in self._chunks:
+            if most is not None and spent > most:
+                break
+            if (content := self._content(place)) is None:
+                continue
+            spent += len(content)
+            found = self._walk(content, ids, place)
             if len(found):
+                content, found = _without_others(content, found)
                 held += len(content)
                 check_decoded(self._path, self._size, held)
                 parts.append((content, found))
@@ -284,36 +347,81 @@ class McapReader:
         self._file.seek(place)
         return self._file.read(length)
 
-    def _scan(self) -> None:
-        """Go through the records outside of chunks."""
-        at = len(MAGIC)
-        while at + _HEAD.size <= self._size:
+    def _summary(self) -> tuple[int, bool]:
+        """Begin of the section behind the data, 0 if there is none, and whether its topics are sound."""
+        length = FOOTER + len(MAGIC)
+        tail = self._at(max(self._size - length, 0), length)
+        if len(tail) < length or tail[0] != Opcode.FOOTER:
+            return 0, False
+        self.whole = True
+        begin, _, crc = struct.unpack_from("<QQI", tail, _HEAD.size)
+        if not len(MAGIC) < begin < self._size:
+            return 0, False
+        raw = self._at(begin, self._size - begin - len(MAGIC) - 4)
+        if crc and zlib.crc32(raw) != crc:
+            self.damaged.add(begin)
+            return begin, False
+        at = 0
+        while at + _HEAD.size <= len(raw):
+            opcode, length = _HEAD.unpack_from(raw, at)
+            at += _HEAD.size
+            content = raw[at : at + length]
+            try:
+                if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                    self._learn(opcode, content)
+                elif opcode == Opcode.CHUNK_INDEX:
+                    chunk = records.ChunkIndex.read(ReadDataStream(BytesIO(content)))
+                    self._chunks[chunk.chunk_start_offset + _HEAD.size] = chunk.chunk_length - _HEAD.size
+                    self.compression.add(chunk.compression)
+                    begin_end = chunk.message_start_time, chunk.message_end_time
+                    self._spans[chunk.chunk_start_offset + _HEAD.size] = begin_end
+            except _DAMAGED:
+                return begin, False
+            at += length
+        return begin, True
+
+    def _scan(self, at: int, end: int) -> None:
+        """Go through the records outside of chunks; those behind a damaged one are found by the index."""
+        indexed, self._chunks, place = self._chunks, {}, 0
+        while at + _HEAD.size <= end:
             head = self._at(at, ROOM)
             opcode, length = _HEAD.unpack_from(head)
             body = at + _HEAD.size
-            if body + length > self._size:
-                return
+            if not (1 <= opcode <= Opcode.DATA_END or opcode >= PRIVATE) or body + length > end:
+                if not self.whole and body + length > end:
+                    break  # the rest is missing
+                self.damaged.add(body)
+                at = min((other - _HEAD.size for other in indexed if other > body), default=end)
+                continue
             if opcode == Opcode.CHUNK:
-                self._chunks.append((body, length))
+                self._chunks[body], place = length, body
+            elif opcode == Opcode.MESSAGE_INDEX:
+                self._indexes.extend((body, length, place))
             elif opcode == Opcode.MESSAGE and length >= ROOM - _HEAD.size:
                 channel, _, received = struct.unpack_from("<HIq", head, _HEAD.size)
                 numbers = channel, received, at + ROOM, length - (ROOM - _HEAD.size)
                 self._loose.extend(numbers)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
-                self._learn(opcode, self._at(body, length))
-            elif opcode == Opcode.FOOTER:
-                self.whole = self._at(body + length, len(MAGIC)) == MAGIC
-                return
+                try:
+                    self._learn(opcode, self._at(body, length))
+                except _DAMAGED:
+                    self.damaged.add(body)
             at = body + length
+        self._chunks = dict(sorted((self._chunks | indexed).items()))
 
     def _learn(self, opcode: int, content: bytes) -> None:
         stream = ReadDataStream(BytesIO(content))
         if opcode == Opcode.SCHEMA:
             schema = records.Schema.read(stream)
-            self._schemas[schema.id] = schema.name
+            kind = schema.name
+            if schema.encoding.startswith("ros1") and kind.count("/") == 1:
+                kind = kind.replace("/", "/msg/")
+            self._schemas.setdefault(schema.id, kind)
+            if schema.encoding in ("ros1msg", "ros2msg"):
+                self.definitions[kind] = schema.encoding, schema.data.decode(errors="replace")
         elif opcode == Opcode.CHANNEL:
             channel = records.Channel.read(stream)
-            self._channels[channel.id] = channel
+            self._channels.setdefault(channel.id, channel)
         else:
             self._noted += len(content)
             if self._noted > (most := BUDGETS["JSON"].file):
@@ -321,7 +429,7 @@ class McapReader:
             note = records.Metadata.read(stream)
             self.notes[note.name] = note.metadata
 
-    def _walk(self, content: Bytes, wanted: Collection[int]) -> NDArray[np.int64]:
+    def _walk(self, content: Bytes, wanted: Collection[int], place: int) -> NDArray[np.int64]:
         """Channel, time, offset and size of wanted messages, shape (M, 4); learns schemas and channels."""
         places: list[int] = []
         raw, at, size = content.data, 0, len(content)
@@ -330,7 +438,8 @@ class McapReader:
             opcode, length, channel = unpack(raw, at)
             after = at + 9 + length
             if after > size:
-                raise InputError("a record ends outside of its chunk")
+                self.damaged.add(place)  # a record ends outside of its chunk
+                break
             if opcode == message:
                 if channel in wanted and length >= ROOM - 9:
                     places.append(at)
@@ -342,23 +451,41 @@ class McapReader:
         columns = _windows(content, "<u2")[start + 9], _windows(content, "<u8")[start + 15]
         return np.stack([*(c.astype(np.int64) for c in columns), start + ROOM, sizes], axis=1)
 
-    def _content(self, place: int, length: int) -> Bytes:
-        """The uncompressed content of a chunk; its checksum is verified."""
-        chunk = records.Chunk.read(ReadDataStream(BytesIO(self._at(place, length))))
+    def _content(self, place: int) -> Bytes | None:
+        """The uncompressed content of a chunk; None if it is damaged, as its checksum shows."""
+        try:
+            chunk = records.Chunk.read(ReadDataStream(BytesIO(self._at(place, self._chunks[place]))))
+        except _DAMAGED:
+            self.damaged.add(place)
+            return None
         size, raw, codec = chunk.uncompressed_size, chunk.data, chunk.compression
         most = min(LARGEST_CHUNK, self._spare + MOST_RATIO * len(raw))
         if size > most or codec not in ("", "zstd", "lz4"):
+            if len(self._chunks) > 1 and (size > SPARE + MOST_RATIO * len(raw) or size <= most):
+                self.damaged.add(place)
+                return None
             raise InputError(
                 f"a chunk claims {size} bytes, compressed to {len(raw)} ({codec[:8]}); not supported"
             )
         self._spare -= max(0, size - MOST_RATIO * len(raw))
         try:
             content = pa.Codec(codec).decompress(raw, size) if codec else raw
-        except (pa.ArrowException, OSError, ValueError) as error:
-            raise InputError(f"a damaged chunk ({str(error).splitlines()[0]})") from error
+        except (pa.ArrowException, OSError, ValueError):
+            content = b""
         whole = np.frombuffer(content, np.uint8)
-        if len(whole) != size or (
-            chunk.uncompressed_crc and zlib.crc32(whole.data) != chunk.uncompressed_crc
-        ):
-            raise InputError("a damaged chunk (its checksum differs)")
+        crc = chunk.uncompressed_crc
+        if len(whole) != size or (crc and zlib.crc32(whole.data) != crc):
+            self.damaged.add(place)
+            return None
         return whole
+
+
+def _without_others(content: Bytes, found: NDArray[np.int64]) -> tuple[Bytes, NDArray[np.int64]]:
+    """Content without the bytes of other messages, if these are most of it."""
+    sizes = found[:, 3]
+    total = int(sizes.sum())
+    if 4 * total > len(content):
+        return content, found
+    begins = np.cumsum(sizes) - sizes
+    at = np.arange(total) + np.repeat(found[:, 2] - begins, sizes)
+    return content[at], np.column_stack([found[:, :2], begins, sizes])

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError, find
 from magtwin.field.units import NT_PER, Unit, check_factor
-from magtwin.io.bags.bag import Bag, Signal
+from magtwin.io.bags.bag import Bag
 from magtwin.io.bags.cdr import Index, decode
-from magtwin.io.bags.recording import ROLES, read_recording, taken
 from magtwin.io.bags.topics import NAMES, READING, TOPICS, VECTOR, Topic
 from magtwin.io.bags.types import layout
+from magtwin.io.recording.roles import check_roles
+from magtwin.io.recording.run import Recording, taken
+from magtwin.io.recording.signal import Signal, read_signal
 from magtwin.run.arrow import check_metadata, spec_said
 from magtwin.run.run import Column, Run
 
@@ -62,25 +64,29 @@ def read_bag(
             scale is not above 0, or is given beside a unit.
     """
     check_factor(unit, scale)
-    for name in topics or ():
-        find("topic", name, {topic.name: topic for topic in ROLES})
+    check_roles(topics or ())
     with Bag(Path(path)) as bag, np.errstate(over="ignore", invalid="ignore"):
         if READING.name in bag.kinds and NAMES.name in bag.kinds and not topics:
             if unit or scale is not None:
                 raise InputError(
                     f"{bag.path}: magtwin wrote it and it holds its unit; drop {unit or scale!r}"
                 )
-            return _own(bag)
-        return read_recording(bag, topics or {}, unit=unit, scale=scale, survey=survey)
+            if (run := _own(bag)) is not None:
+                return run
+        recording = Recording(bag, topics or {}, survey=survey)
+        recording.read(unit, scale)
+        return recording.run
 
 
-def _own(bag: Bag) -> Run:
-    """The run that magtwin wrote."""
+def _own(bag: Bag) -> Run | None:
+    """The run that magtwin wrote; None if the names of its columns were damaged."""
     _check_kinds(bag, (READING, NAMES))
     carriers = {name for name, topic in TOPICS.items() if topic.carried} & bag.kinds.keys()
     messages = bag.messages((READING.name, NAMES.name, *carriers))
     rows = messages[READING.name]
     texts = decode(layout(NAMES.kind), messages[NAMES.name], ["data"])["data"]
+    if not texts and bag.damaged:
+        return None
     if not texts:
         raise InputError(f"{bag.path}: a recording into which nothing was written yet")
     table = json.loads(texts[0])
@@ -92,7 +98,7 @@ def _own(bag: Bag) -> Run:
     _check_kinds(bag, topics)
     carried: dict[str, NDArray[Any]] = {}
     for topic in topics:
-        signal = bag.signal(topic.name, topic, messages[topic.name])
+        signal = read_signal(bag, topic.name, topic, messages[topic.name])
         carried |= _carried(signal, rows.received, str(table["unit"]))
     columns: dict[str, NDArray[Any]] = {}
     specs: dict[str, Column] = {}

@@ -79,7 +79,10 @@ class StoredTopic(NamedTuple):
     topic: str
     kind: str
     encoding: str
-    """Encoding of its messages; only "cdr" can be read."""
+    """Encoding of its messages; "cdr" and "ros1" can be read."""
+
+    qos: str = ""
+    """Quality of service that its publishers offered, as YAML; "" if unknown."""
 
 
 def bag_metadata(

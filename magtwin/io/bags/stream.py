@@ -1,14 +1,16 @@
 """Stream: the messages that a robot sends as a run goes on."""
 
 import json
+import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, RepairWarning
 from magtwin.io.bags.cdr import NS, Index
 from magtwin.io.bags.sender import Sender
 from magtwin.io.bags.topics import DESCRIPTION, NAMES, READING, SCAN, TF_STATIC, TOPICS, Columns, Topic
@@ -48,6 +50,7 @@ class Stream:
     Args:
         run: Some rows, which define the columns.
         sender: The robot.
+        lab: Fields of messages about the lab, by topic, which are sent once.
         scans: The LiDAR's scans of the whole run; None sends no scans.
         topics: Topics to send, as far as the run has their columns.
         whole: Put every column into /magtwin/reading, not only those that no other topic carries, and the
@@ -64,10 +67,13 @@ class Stream:
         scans: "Scans | None",
         *,
         topics: Iterable[Topic] = tuple(TOPICS.values()),
+        lab: Mapping[Topic, Mapping[str, Any]] = MappingProxyType({}),
         whole: bool = False,
     ) -> None:
-        self._sender, self._scans = sender, scans
-        self._t = -np.inf
+        self._sender, self._scans, self._lab = sender, scans, lab
+        self._t, self._stamp = -np.inf, -1
+        self.later_s = _later_s(run)
+        """Time by which stamps are later than t, so that none is below 0 [s]."""
         self._last: dict[str, _Last] = {}
         columns = set(run)
         sent = [t for t in topics if t.needs and columns.issuperset(t.needs)]
@@ -82,6 +88,7 @@ class Stream:
             NAMES,
             *[TF_STATIC] * bool(sender.links),
             *[DESCRIPTION] * bool(sender.description),
+            *lab,
         ]
         self.topics = [*once, *sent, *([] if scans is None else [SCAN]), READING]
         """Topics that are sent."""
@@ -99,14 +106,16 @@ class Stream:
         for topic in once:
             first = stamps[:1] if len(stamps) else np.zeros(1, np.int64)
             fields = {"data": self._table} if topic is NAMES else topic.write({}, first, self._sender)
+            if topic in self._lab:
+                fields = {"header.stamp": first, **self._lab[topic]}
             yield topic, first, fields
         for topic in self.topics:
             if topic.needs:
                 rows = self._rows(topic, run, t)
-                names = dict.fromkeys((*topic.needs, "wheel_angle", "odom_v", "b_sd_nt"))
-                chosen = {name: run[name][rows] for name in names if name in run}
-                fields = topic.write(chosen, stamps[rows], self._sender)
-                yield topic, stamps[rows], fields
+                names = dict.fromkeys((*topic.needs, *topic.by, "wheel_angle", "odom_v", "b_sd_nt"))
+                for part in _alike(run, topic.by, rows):
+                    chosen = {name: run[name][part] for name in names if name in run}
+                    yield topic, stamps[part], topic.write(chosen, stamps[part], self._sender)
         data = np.column_stack([np.asarray(run[name], float) for name in self._rest])
         yield READING, stamps, {"data": data}
         if len(t):
@@ -124,7 +133,7 @@ class Stream:
         k = int(np.searchsorted(self._scans.arrival, until_s, side="right"))
         arrived, self._scans = self._scans.take(slice(k)), self._scans.take(slice(k, None))
         times = (arrived.t, arrived.arrival)
-        moments, came = (np.rint(t * NS).astype(np.int64) for t in times)
+        moments, came = (np.rint((t + self.later_s) * NS).astype(np.int64) for t in times)
         fields = SCAN.write({"ranges_m": arrived.ranges_m}, moments, self._sender)
         yield SCAN, came, fields
 
@@ -134,14 +143,16 @@ class Stream:
         t = np.asarray(run["t"], float)
         if len(t) and t[0] <= self._t:
             raise InputError(f"time runs backwards: rows at {t[0]:.9g} s come after rows at {self._t:.9g} s")
-        if len(t) and not (t[0] >= 0 and t[-1] < LATEST_S):
+        if len(t) and not t[-1] + self.later_s < LATEST_S:
             raise InputError(
                 f"t runs from {t[0]:.9g} to {t[-1]:.9g} s, but stamps of ROS hold 0 to {LATEST_S:.0f} s: "
                 "subtract the first time from t"
             )
-        stamps = np.rint(t * NS).astype(np.int64)
-        if (np.diff(stamps) <= 0).any():
-            raise InputError("rows less than 1 ns apart cannot stand in a bag, as their stamps are the same")
+        # Rows of the same nanosecond are stamped 1 ns apart; their t is in /magtwin/reading.
+        count = np.arange(len(t))
+        stamps = np.rint((t + self.later_s) * NS).astype(np.int64) - count
+        stamps = np.maximum(np.maximum.accumulate(stamps), self._stamp + 1) + count
+        self._stamp = int(stamps[-1]) if len(t) else self._stamp
         return t, stamps
 
     def _rows(self, topic: Topic, run: Columns, t: Array) -> NDArray[np.intp]:
@@ -195,6 +206,28 @@ class Stream:
             {"facts": dict(metadata)} if metadata else {}
         )
         return json.dumps(table, ensure_ascii=False, indent=1)
+
+
+def _later_s(run: Run) -> float:
+    """Whole seconds from a time before 0 at which a run begins to 0 [s]; 0 for other runs. Warns."""
+    begin = float(run["t"][0]) if "t" in run and run.rows else 0.0
+    if not -np.inf < begin < 0:
+        return 0.0
+    later = float(-np.floor(begin))
+    text = (
+        f"t begins at {begin:.9g} s, and stamps of ROS at 0: they are t + {later:g} s; magtwin reads t back"
+    )
+    warnings.warn(text, RepairWarning, stacklevel=4)
+    return later
+
+
+def _alike(run: Columns, flags: Iterable[str], rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Rows of a topic, those of equal flags together."""
+    known = [np.asarray(run[name][rows], bool) for name in flags if name in run]
+    if not known:
+        return [rows]
+    state = np.sum([values.astype(int) << k for k, values in enumerate(known)], axis=0)
+    return [rows[state == each] for each in np.unique(state)]
 
 
 def _finite(run: Columns, names: Iterable[str]) -> NDArray[np.bool_]:

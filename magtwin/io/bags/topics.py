@@ -76,11 +76,17 @@ class Topic:
     frame: str = ""
     """Attribute of the sender with the frame of the header. Default: no header."""
 
+    by: tuple[str, ...] = ()
+    """Columns of flags that select the text of a message; messages are written for equal flags at a time."""
+
     more: Callable[[Columns, NDArray[np.int64], Sender], Fields] = lambda c, stamp, sender: {}
     """Fields of messages beyond the header and the columns of `reads`; also called with the stamps [ns]."""
 
-    reads: Mapping[str, Mapping[str, str | tuple[str, int]]] = field(default_factory=dict)
-    """By message type: the leaf of each column that is read, or a leaf and an index into it."""
+    reads: Mapping[str, Mapping[str, str | tuple[str, int] | tuple[str, ...]]] = field(default_factory=dict)
+    """By message type: the leaf of each column that is read, a leaf and an index, or several leaves."""
+
+    turned: Mapping[str, Callable[[dict[str, Array]], dict[str, Array]]] = field(default_factory=dict)
+    """By message type: the columns in the axes of REP 103, of columns in others."""
 
     def write(self, c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
         """Fields of messages, from the columns of some rows and their stamps [ns]."""
@@ -91,16 +97,22 @@ class Topic:
 
     def leaves(self, kind: str) -> list[str]:
         """Names of the leaves of a message type that are read."""
-        return [leaf if isinstance(leaf, str) else leaf[0] for leaf in self.reads[kind].values()]
+        leaves = [(leaf,) if isinstance(leaf, str) else leaf for leaf in self.reads[kind].values()]
+        return [name for parts in leaves for name in parts if isinstance(name, str)]
 
     def read(self, kind: str, fields: Fields) -> dict[str, NDArray[Any]]:
         """The columns that the fields of messages give."""
         columns = {}
         for name, leaf in self.reads[kind].items():
-            values = fields[leaf] if isinstance(leaf, str) else fields[leaf[0]][:, leaf[1]]
+            if isinstance(leaf, str):
+                values = fields[leaf]
+            elif isinstance(leaf[1], int):
+                values = fields[leaf[0]][:, leaf[1]]
+            else:
+                values = np.stack([fields[str(part)] for part in leaf], axis=-1)
             # ROS counts current into the battery, magtwin out of it
             columns[name] = -values.astype(float) if name == "battery_a" else values.astype(float, copy=False)
-        return columns
+        return self.turned[kind](columns) if kind in self.turned else columns
 
 
 def nt_per(sender: Sender) -> float:
@@ -226,6 +238,33 @@ def _static(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
     return transform_fields(stamp, links)
 
 
+_FAULTS: Mapping[str, tuple[str, int, str]] = {
+    "flag_lost_lock": ("magnetometer", 2, "it lost lock"),
+    "flag_outside_map": ("magnetometer", 1, "outside the map"),
+    "flag_out_of_distribution": ("network", 1, "an input left its training range"),
+    "flag_pose_lost": ("motion capture", 1, "it lost the robot"),
+    "flag_bump": ("drive", 1, "it touched an obstacle"),
+}
+"""By flag: the part that it is about, its level in a DiagnosticStatus (1: warn, 2: error), and its text."""
+
+
+def _diagnosed(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
+    """The state of each part of the robot; the flags of all rows are equal."""
+    known = {flag: fault for flag, fault in _FAULTS.items() if flag in c}
+    fields: Fields = {"header.stamp": stamp, "status": len({part for part, _, _ in known.values()})}
+    for k, name in enumerate(dict.fromkeys(part for part, _, _ in known.values())):
+        faults = [(level, text) for flag, (part, level, text) in known.items() if part == name and c[flag][0]]
+        fields |= {
+            f"status.{k}.name": name,
+            f"status.{k}.level": max((level for level, _ in faults), default=0),
+        }
+        fields |= {
+            f"status.{k}.message": "; ".join(text for _, text in faults) or "ok",
+            f"status.{k}.values": 0,
+        }
+    return fields
+
+
 def _scan(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
     """Ranges along `magtwin.sim.sensors.lidar.ray_angles`, as in REP 117; one stamp per scan."""
     step = 2 * np.pi / c["ranges_m"].shape[1]
@@ -244,11 +283,38 @@ def _pose_at(prefix: str, p: str = "position", q: str = "orientation") -> dict[s
     return {"mocap_p": prefix + p, "mocap_q_xyzw": prefix + q}
 
 
-def _carrier(kind: str, leaves: dict[str, str], **rest: Any) -> Topic:
-    """A topic whose message type holds each of its columns in a leaf."""
-    return Topic(kind=kind, needs=tuple(leaves), carried=True, reads={kind: leaves}, **rest)
+def _carrier(
+    kind: str, leaves: dict[str, str], others: Mapping[str, Any] = MappingProxyType({}), **rest: Any
+) -> Topic:
+    """A topic whose message type holds each of its columns in a leaf; `others` are `reads` of other types."""
+    return Topic(kind=kind, needs=tuple(leaves), carried=True, reads={kind: leaves, **others}, **rest)
 
 
+def _of_frd(columns: dict[str, Array]) -> dict[str, Array]:
+    """Vectors in forward-right-down axes as forward-left-up."""
+    return {name: values * (1.0, -1.0, -1.0) for name, values in columns.items()}
+
+
+def _of_px4_imu(columns: dict[str, Array]) -> dict[str, Array]:
+    return _of_frd(columns) | {"imu_q_xyzw": np.zeros((len(columns["imu_w"]), 4))}
+
+
+def _of_ned(columns: dict[str, Array], name: str = "odom") -> dict[str, Array]:
+    """Odometry of PX4, from north-east-down and forward-right-down to ENU and forward-left-up.
+
+    Its quaternion is w first, and its velocity is in north-east-down.
+    """
+    q_ned_frd = columns[f"{name}_q_xyzw"][:, [1, 2, 3, 0]]
+    enu = np.array([1.0, 1.0, 0.0, 0.0]) / np.sqrt(2.0)  # half a turn about x + y
+    q = quat_multiply(quat_multiply(enu, q_ned_frd), np.array([1.0, 0.0, 0.0, 0.0]))
+    p = columns[f"{name}_p"][:, [1, 0, 2]] * (1.0, 1.0, -1.0)
+    turned = _of_frd({"odom_w": columns["odom_w"]}) if "odom_w" in columns else {}
+    if "odom_v" in columns:
+        turned |= _of_frd({"odom_v": rotate(quat_conjugate(q_ned_frd), columns["odom_v"])})
+    return {f"{name}_p": p, f"{name}_q_xyzw": q} | turned
+
+
+_PX4 = "px4_msgs/msg/"
 _FIELD = "sensor_msgs/msg/MagneticField"
 
 POSE = Topic(
@@ -263,7 +329,9 @@ POSE = Topic(
         "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_at("pose.pose."),
         "geometry_msgs/msg/TransformStamped": _pose_at("transform.", "translation", "rotation"),
         "nav_msgs/msg/Odometry": _pose_at("pose.pose."),
+        _PX4 + "VehicleOdometry": {"mocap_p": "position", "mocap_q_xyzw": "q"},
     },
+    turned={_PX4 + "VehicleOdometry": lambda c: _of_ned(c, "mocap")},
 )
 ODOMETRY = _carrier(
     "nav_msgs/msg/Odometry",
@@ -273,6 +341,15 @@ ODOMETRY = _carrier(
         "odom_v": "twist.twist.linear",
         "odom_w": "twist.twist.angular",
     },
+    {
+        _PX4 + "VehicleOdometry": {
+            "odom_p": "position",
+            "odom_q_xyzw": "q",
+            "odom_v": "velocity",
+            "odom_w": "angular_velocity",
+        }
+    },
+    turned={_PX4 + "VehicleOdometry": _of_ned},
     name="/robot/odom",
     frame="odom_frame",
     more=_odometry,
@@ -280,6 +357,8 @@ ODOMETRY = _carrier(
 IMU = _carrier(
     "sensor_msgs/msg/Imu",
     {"imu_q_xyzw": "orientation", "imu_w": "angular_velocity", "imu_a": "linear_acceleration"},
+    {_PX4 + "SensorCombined": {"imu_w": "gyro_rad", "imu_a": "accelerometer_m_s2"}},
+    turned={_PX4 + "SensorCombined": _of_px4_imu},
     name="/robot/imu",
     frame="imu_frame",
     more=_imu,
@@ -303,9 +382,13 @@ MAGNITUDE = Topic(
     reads={
         _FIELD: {"magnetic_field": "magnetic_field"},
         "geometry_msgs/msg/Vector3Stamped": {"magnetic_field": "vector"},
+        "geometry_msgs/msg/Vector3": {"magnetic_field": ("x", "y", "z")},
         "std_msgs/msg/Float64": {"magnetic_field": "data"},
         "std_msgs/msg/Float32": {"magnetic_field": "data"},
+        _PX4 + "VehicleMagnetometer": {"magnetic_field": "magnetometer_ga"},
+        _PX4 + "SensorMag": {"magnetic_field": ("x", "y", "z")},
     },
+    turned=dict.fromkeys((_PX4 + "VehicleMagnetometer", _PX4 + "SensorMag"), _of_frd),
 )
 VECTOR = Topic(
     name="/robot/qtfm/field",
@@ -370,6 +453,17 @@ SCAN = Topic(
     more=_scan,
     reads={"sensor_msgs/msg/LaserScan": {"stamp": "header.stamp"}},
 )
+OCCUPANCY = Topic(name="/map", kind="nav_msgs/msg/OccupancyGrid", qos=LATCHED, sent="once")
+FIELD = Topic(name="/anomaly_map", kind="sensor_msgs/msg/PointCloud2", qos=LATCHED, sent="once")
+DIAGNOSTICS = Topic(
+    name="/diagnostics",
+    kind="diagnostic_msgs/msg/DiagnosticArray",
+    needs=("t",),
+    sent="ticks",
+    every_s=1.0,
+    more=_diagnosed,
+    by=tuple(_FAULTS),
+)
 NAMES = Topic(name="/magtwin/columns", kind="std_msgs/msg/String", qos=LATCHED, sent="once")
 READING = Topic(
     name="/magtwin/reading",
@@ -383,7 +477,7 @@ TOPICS: Mapping[str, Topic] = MappingProxyType(
         topic.name: topic
         for topic in (
             *(POSE, ODOMETRY, IMU, BATTERY, MAGNITUDE, VECTOR, COMMAND, JOINTS, SCAN),
-            *(TF, TF_STATIC, DESCRIPTION, CLOCK, NAMES, READING),
+            *(TF, TF_STATIC, DESCRIPTION, CLOCK, DIAGNOSTICS, OCCUPANCY, FIELD, NAMES, READING),
         )
     }
 )

@@ -1,5 +1,6 @@
 """Message types of ROS 2, flattened to leaves for `magtwin.io.bags.cdr`; definitions come from rosbags."""
 
+from collections import ChainMap
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
@@ -11,6 +12,9 @@ _CODES = {"float64": "f8", "float32": "f4", "bool": "u1", "byte": "u1", "char": 
 _CODES |= {f"{sign}int{8 * size}": f"{sign[:1] or 'i'}{size}" for sign in ("u", "") for size in (1, 2, 4, 8)}
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 """Types of stamps, one leaf of whole nanoseconds."""
+
+MOST_TEXT, MOST_LEAVES, DEEPEST = 200_000, 20_000, 30
+"""Limits of a definition in a bag: characters, parts, and depth of structures."""
 
 
 @cache
@@ -64,6 +68,40 @@ def fields_of(kind: str) -> list[tuple[str, Any]]:
     return known[kind][1]
 
 
+class Types:
+    """The message types of a bag: those of ROS, and others by the definitions that stand in the bag.
+
+    A definition is data: rosbags parses it, and nothing is generated from it.
+    """
+
+    def __init__(self) -> None:
+        self._texts: dict[tuple[str, bool], str] = {}
+        self._leaves: dict[tuple[str, bool], tuple[Leaf, ...]] = {}
+
+    def learn(self, kind: str, text: str, *, ros1: bool = False) -> None:
+        """Keep the definition of a type, which is parsed when it is needed."""
+        if len(text) <= MOST_TEXT:
+            self._texts.setdefault((kind, ros1), text)
+
+    def layout(
+        self, kind: str, counts: Mapping[str, Any] | None = None, *, ros1: bool = False
+    ) -> tuple[Leaf, ...]:
+        """The leaves of a type, as `layout`; a type of ROS 1 is always that of the bag."""
+        key = kind, ros1
+        if key not in self._texts or (not ros1 and kind in typestore().fielddefs):
+            return layout(kind, counts)
+        if counts or key not in self._leaves:
+            from rosbags.typesys import get_types_from_msg
+
+            own = get_types_from_msg(self._texts[key], kind)
+            known = own if ros1 else ChainMap(typestore().fielddefs, own)
+            leaves = tuple(_leaves(kind, "", counts or {}, known))
+            if counts:
+                return leaves
+            self._leaves[key] = leaves
+        return self._leaves[key]
+
+
 def layout(kind: str, counts: Mapping[str, Any] | None = None) -> tuple[Leaf, ...]:
     """The leaves of a message type, in the order of its bytes.
 
@@ -81,25 +119,30 @@ def layout(kind: str, counts: Mapping[str, Any] | None = None) -> tuple[Leaf, ..
     """
     plain = _layout(kind)
     return (
-        tuple(_leaves(kind, "", counts)) if counts and any(leaf.kind == "none" for leaf in plain) else plain
+        tuple(_leaves(kind, "", counts, typestore().fielddefs))
+        if counts and any(leaf.kind == "none" for leaf in plain)
+        else plain
     )
 
 
 @cache
 def _layout(kind: str) -> tuple[Leaf, ...]:
-    return tuple(_leaves(kind, "", {}))
+    fields_of(kind)
+    return tuple(_leaves(kind, "", {}, typestore().fielddefs))
 
 
-def _leaves(kind: str, prefix: str, counts: Mapping[str, Any]) -> list[Leaf]:
+def _leaves(kind: str, prefix: str, counts: Mapping[str, Any], known: Mapping[str, Any]) -> list[Leaf]:
     from rosbags.interfaces import Nodetype
 
+    if prefix.count(".") > DEEPEST:
+        raise InputError(f"{kind} is nested over {DEEPEST} deep; it is not read")
     leaves: list[Leaf] = []
-    for name, (node, described) in fields_of(kind):
+    for name, (node, described) in known[kind][1]:
         name = f"{prefix}{name}"
         if node is Nodetype.BASE:
             leaves.append(Leaf(name, _CODES[described[0]]))
         elif node is Nodetype.NAME:
-            leaves += _structure(described, name, counts)
+            leaves += _structure(described, name, counts, known)
         else:
             (inner, element), count = described
             if inner is Nodetype.BASE:
@@ -111,15 +154,17 @@ def _leaves(kind: str, prefix: str, counts: Mapping[str, Any]) -> list[Leaf]:
                 if node is Nodetype.SEQUENCE:
                     count = int(counts[name])
                     leaves.append(Leaf(name, "u4"))
+                if len(leaves) + count > MOST_LEAVES:
+                    raise InputError(f"{kind} has over {MOST_LEAVES:,} parts; it is not read")
                 for k in range(count):
-                    leaves += _structure(element, f"{name}.{k}", counts)
+                    leaves += _structure(element, f"{name}.{k}", counts, known)
     return leaves
 
 
-def _structure(kind: str, name: str, counts: Mapping[str, Any]) -> list[Leaf]:
+def _structure(kind: str, name: str, counts: Mapping[str, Any], known: Mapping[str, Any]) -> list[Leaf]:
     if kind in TIMES:
         return [Leaf(name, "time")]
-    inner = _leaves(kind, f"{name}.", counts)
+    inner = _leaves(kind, f"{name}.", counts, known)
     same = {(leaf.kind, leaf.count) for leaf in inner}
     if (
         len(inner) > 1

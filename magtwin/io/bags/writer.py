@@ -13,6 +13,7 @@ import numpy as np
 from magtwin.errors import InputError
 from magtwin.files.outputs import check_free, output, why_full
 from magtwin.io.bags.cdr import encode
+from magtwin.io.bags.lab import lab_fields
 from magtwin.io.bags.mcap import McapWriter
 from magtwin.io.bags.sender import Unit
 from magtwin.io.bags.storage import PARTIAL, ROOM, Batch, Connection, bag_metadata, partial_of, to_yaml
@@ -75,7 +76,8 @@ def write_bag(
     with output(path, force=force) as aside, one_line(path):
         bag = _Bag(aside)
         try:
-            stream = Stream(run, sender, scans)
+            lab = {} if twin is None else lab_fields(twin, sender.map_frame)
+            stream = Stream(run, sender, scans, lab=lab)
             bag.begin(run, stream)
             for block in blocks(run, BLOCK):
                 bag.send(stream.messages(block))

@@ -15,6 +15,7 @@ from magtwin.io.rerun.series import (
     COLUMNS_ENTITY,
     DERIVED,
     DERIVED_ENTITY,
+    ERRORS,
     STATES,
     TIMELINE,
     derived,
@@ -54,16 +55,18 @@ class Series:
 
 _BLUE, _ORANGE, _GREEN, _GREY = (86, 156, 255), (255, 158, 64), (92, 200, 120), (165, 165, 165)
 _DIM = (118, 106, 150)
+_NAMES = {_BLUE: "blue", _ORANGE: "orange", _GREEN: "green", _GREY: "grey", _DIM: "violet"}
+"""Names of colours, which the title of a plot gives with its lines, in place of a legend over them."""
+
+_SPIKES = 0.005
+"""Share of the largest and of the smallest values of an error that its axis may leave out."""
 
 PLOTS: Mapping[str, Mapping[str, tuple[Series, ...]]] = {
     "": {
         "Total field [nT]": (
-            Series("b_total_nt", "total = map + disturbance", _ORANGE, width=4.0),
+            Series("b_total_nt", "map + disturbance", _ORANGE, width=4.0),
             Series("b_measured_nt", "measured", _GREEN, width=1.0),
             Series("b_map_nt", "map", _BLUE),
-            Series("b_truth_nt", "truth", _GREY),
-            Series("interval_low_nt", "90 % interval", _DIM),
-            Series("interval_high_nt", "90 % interval", _DIM),
         ),
         "Disturbance [nT]": (Series("b_disturbance_nt", "disturbance", _ORANGE),),
         "Error [nT]": (
@@ -74,15 +77,15 @@ PLOTS: Mapping[str, Mapping[str, tuple[Series, ...]]] = {
         ),
     },
     "Drive": {
-        "Speed [m/s]": (
-            Series("odom_v", "odometry", _GREY, "x", width=3.0),
-            Series("v_base", "true", _BLUE, "x"),
-            Series("v_cmd", "commanded", _ORANGE),
+        "Speed [m/s]": (Series("v_base", "true", _BLUE, "x"),),
+        "Speed less the true one [m/s]": (
+            Series("odom_v_error", "odometry", _GREY),
+            Series("v_cmd_error", "commanded", _ORANGE),
         ),
-        "Yaw rate [rad/s]": (
-            Series("imu_w", "gyroscope", _GREY, "z", width=3.0),
-            Series("w_base", "true", _BLUE, "z"),
-            Series("w_cmd", "commanded", _ORANGE),
+        "Yaw rate [rad/s]": (Series("w_base", "true", _BLUE, "z"),),
+        "Yaw rate less the true one [rad/s]": (
+            Series("gyro_error", "gyroscope", _GREY),
+            Series("w_cmd_error", "commanded", _ORANGE),
         ),
     },
     "IMU": {
@@ -172,7 +175,7 @@ def layout(
     }
     series = stacks.pop("")
     tabs = [rrb.Vertical(*views, name=tab) for tab, views in stacks.items() if views]
-    shares = [2.2, 1.2, 1.2][: len(series)] + [2.6] * bool(tabs)
+    shares = [1.8, 1.1, 1.5][: len(series)] + [3.0] * bool(tabs)
     side = rrb.Vertical(*series, *([rrb.Tabs(*tabs)] if tabs else []), row_shares=shares)
     if events is None:
         events = [key for key in STATES if key in run and run[key].any()]
@@ -267,7 +270,8 @@ def _plot(
     title: str, lines: Sequence[tuple[Shown, Series, Array]], whole: rrb.TimeAxis
 ) -> rrb.TimeSeriesView:
     """Lines of one unit."""
-    ends = value_range(np.array([(np.nanmin(values), np.nanmax(values)) for _, _, values in lines]))
+    share = _SPIKES if any(series.column in ERRORS for _, series, _ in lines) else 0.0
+    ends = value_range(np.array([np.nanquantile(values, (share, 1 - share)) for _, _, values in lines]))
     overrides: dict[Any, list[rrb.Visualizer]] = {}
     for shown, series, _ in lines:
         entity = entity_of(DERIVED_ENTITY if series.column in DERIVED else COLUMNS_ENTITY, shown.name)
@@ -282,12 +286,23 @@ def _plot(
     return rrb.TimeSeriesView(
         origin="/",
         contents=list(overrides),
-        name=title,
+        name=_titled(title, [(series.name, series.colour) for _, series, _ in lines]),
         axis_x=whole,
         axis_y=rrb.ScalarAxis(range=ends) if ends else None,
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=len(lines) > 1),
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=not _named(lines)),
         overrides=overrides,
     )
+
+
+def _named(lines: Sequence[tuple[Shown, Series, Array]]) -> bool:
+    """Whether the title names the lines: those of one run, or a single one."""
+    return len(lines) < 2 or all(series.colour in _NAMES and not shown.name for shown, series, _ in lines)
+
+
+def _titled(title: str, lines: Sequence[tuple[str, Colour]]) -> str:
+    """A title with the lines by their colours, if there are several."""
+    names = dict.fromkeys(f"{name} ({_NAMES[colour]})" for name, colour in lines if colour in _NAMES)
+    return f"{title}: {', '.join(names)}" if len(names) > 1 else title
 
 
 def value_range(values: Array) -> tuple[float, float] | None:
@@ -327,7 +342,7 @@ def _floor_view(lab: LabSpec, names: Sequence[str]) -> rrb.Spatial2DView:
         name="Map from above [m]",
         background=(24, 26, 31),
         visual_bounds=rrb.VisualBounds2D(x_range=(x0 - more, x1 + more), y_range=(y0 - more, y1 + more)),
-        overrides={entity_of("floor/paths/driven", name): _visible(all_time=True) for name in names},
+        overrides={entity_of("floor/paths/driven", name): _UP_TO_NOW for name in names},
     )
 
 
@@ -336,11 +351,12 @@ def _event_view() -> rrb.TextLogView:
     return rrb.TextLogView(origin="events", name="Events", columns=shown)
 
 
-def _visible(*, all_time: bool) -> rrb.VisibleTimeRanges:
-    """Visible part of an entity that accumulates: all of it, or all up to the time shown."""
-    infinite = rrb.TimeRangeBoundary.infinite()
-    end = infinite if all_time else rrb.TimeRangeBoundary.cursor_relative()
-    return rrb.VisibleTimeRanges(rrb.VisibleTimeRange(TIMELINE, start=infinite, end=end))
+_UP_TO_NOW = rrb.VisibleTimeRanges(
+    rrb.VisibleTimeRange(
+        TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
+    )
+)
+"""Visible part of what accumulates: all up to the time shown."""
 
 
 def _view_3d(
@@ -353,8 +369,8 @@ def _view_3d(
     target: tuple[float, ...],
 ) -> rrb.Spatial3DView:
     """The world in the axes of `origin`, from a position [m]; readings appear with time."""
-    piling_up: dict[Any, Any] = {entity_of("world/driven", name): _visible(all_time=True) for name in names}
-    piling_up |= {entity_of("world/readings", name): _visible(all_time=False) for name in names}
+    ends = ("world/driven", "world/readings")
+    piling_up: dict[Any, Any] = {entity_of(end, name): _UP_TO_NOW for end in ends for name in names}
     return rrb.Spatial3DView(
         origin=origin,
         contents=["/world/**", f"- /{without}/**"],

@@ -83,8 +83,12 @@ STATES: Mapping[str, State] = MappingProxyType(
 DERIVED = (
     *("interval_low_nt", "interval_high_nt", "error_nt", "measured_error_nt"),
     *("error_low_nt", "error_high_nt"),
+    *("odom_v_error", "v_cmd_error", "gyro_error", "w_cmd_error"),
 )
 """Lines of the plots that are not columns: see `derived`."""
+
+ERRORS = ("error_nt", *DERIVED[-4:])
+"""Lines whose axis leaves out rare spikes."""
 
 
 def derived(run: Run) -> dict[str, Array]:
@@ -92,7 +96,7 @@ def derived(run: Run) -> dict[str, Array]:
 
     prediction = b_total - b_unmodelled, interval = prediction -+ 1.645 b_sd, error = prediction - b_truth,
     measured_error = b_measured - b_truth, and error_low, error_high = -+ 1.645 b_sd, which contain 90 % of
-    the errors if b_sd is right.
+    the errors if b_sd is right. The other errors are odometry, commands and gyroscope less the true motion.
     """
     made: dict[str, Array] = {}
     total = prediction_nt(run) if "b_total_nt" in run else None
@@ -110,6 +114,15 @@ def derived(run: Run) -> dict[str, Array]:
         made["error_nt"] = error  # always 0 for a physical magnetometer
     if measured is not None and truth is not None:
         made["measured_error_nt"] = measured - truth
+    for name, column, part, true in (
+        ("odom_v_error", "odom_v", 0, "v_base"),
+        ("v_cmd_error", "v_cmd", None, "v_base"),
+        ("gyro_error", "imu_w", 2, "w_base"),
+        ("w_cmd_error", "w_cmd", None, "w_base"),
+    ):
+        if column in run and true in run:
+            values = run[column] if part is None else run[column][:, part]
+            made[name] = values - run[true][:, 0 if true == "v_base" else 2]
     return made
 
 

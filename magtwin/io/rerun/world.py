@@ -124,7 +124,7 @@ def send_room(
     if planned is not None:
         strip = np.column_stack([planned.p_xy, np.full(len(planned.p_xy), 0.012)])
         white: dict[str, Any] = {"colors": (255, 255, 255)}
-        rec.log("world/planned", rr.LineStrips3D([strip], radii=0.008, **white), static=True)
+        rec.log("world/planned", rr.LineStrips3D([strip], radii=0.004, **white), static=True)
         flat = rr.LineStrips2D([planned.p_xy], radii=0.01, draw_order=1.0, **white)
         rec.log("floor/paths/planned", flat, static=True)
     return scale
@@ -355,7 +355,7 @@ class Robot:
         if before is None:
             paint: dict[str, Any] = {"colors": [self.colour]}
             for entity, style in (
-                ("world/driven", rr.LineStrips3D.from_fields(radii=[0.012 if self.name else 0.006], **paint)),
+                ("world/driven", rr.LineStrips3D.from_fields(radii=[0.012], **paint)),
                 ("floor/paths/driven", rr.LineStrips2D.from_fields(radii=[0.012], draw_order=2.0, **paint)),
                 ("floor/paths/robot", rr.Arrows2D.from_fields(radii=[0.05], draw_order=3.0, **paint)),
             ):
@@ -363,11 +363,10 @@ class Robot:
             if self.scale is not None and "b_total_nt" in run.columns:
                 rec.log("world/readings", rr.LineStrips3D.from_fields(radii=[0.017]), static=True)
         here = np.column_stack([base[:, :2], np.full(len(base), 0.016)])  # seen from above, over the plan
-        line = here if before is None else np.vstack([[[*before["p_world_base"][0, :2], 0.016]], here])
-        end = t[-1:]
-        line = line.astype(np.float32)
-        send(rec, entity_of("world/driven", self.name), end, rr.LineStrips3D, strips=line[None])
-        send(rec, entity_of("floor/paths/driven", self.name), end, rr.LineStrips2D, strips=line[None, :, :2])
+        start = here[:1] if before is None else [[*before["p_world_base"][0, :2], 0.016]]
+        line = np.stack([np.vstack([start, here[:-1]]), here], axis=1).astype(np.float32)
+        send(rec, entity_of("world/driven", self.name), t, rr.LineStrips3D, strips=line)
+        send(rec, entity_of("floor/paths/driven", self.name), t, rr.LineStrips2D, strips=line[:, :, :2])
         if self.scale is not None and "b_total_nt" in run.columns:
             sensor = (base + rotate(q, self.interior.robot.p_base_magnetometer)).astype(np.float32)
             start = sensor[:1]

@@ -18,7 +18,7 @@ from magtwin.field.survey.readings import TAKEN, Readings
 from magtwin.field.survey.saved import load_readings
 from magtwin.files.file import existing, sha256
 from magtwin.files.kinds import READINGS, RUN, SURVEY, expected, kind_of
-from magtwin.io.formats import read_run
+from magtwin.io.formats import is_bag, read_run
 from magtwin.io.surveys.axes import levelled
 from magtwin.io.surveys.columns import Columns
 from magtwin.io.surveys.logs import is_log, table_of_log
@@ -27,9 +27,6 @@ from magtwin.run.run import Run
 from magtwin.tables.table import PARQUET, read_table
 
 Source = str | os.PathLike[str]
-
-BAGS = (".mcap", ".db3")
-"""Suffixes of rosbag2 storage files."""
 
 POSE, MAGNITUDE = "/robot/enu/pose", "/robot/qtfm/magnitude"
 """Names of the topics of poses and magnitudes in `magtwin.io.bags.topics`."""
@@ -195,13 +192,14 @@ def _part(
     if kind is SURVEY:
         return read_grid(path, headings_deg=headings_deg, unit=columns.unit or "nT", scale=columns.scale)
     options: dict[str, Any] = {}
-    if path.suffix.lower() in BAGS or (path / "metadata.yaml").is_file():
+    if is_bag(path):
         options = {"topics": topics, "unit": columns.unit, "scale": columns.scale, "survey": True}
     elif columns.scale is not None:
         raise InputError(f"{path}: its field is in nT already; leave out --scale")
     if kind is READINGS:
         return load_readings(path)
-    return readings_of_run(read_run(path, **options), name=path.stem, source=_sum(path))
+    run = read_run(path, **options)
+    return readings_of_run(run, name=path.stem, source=_sum(path))
 
 
 def _beside(first: Path, word: str) -> Path:

@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 
 SCALERS = ("x_mean", "x_scale", "x_min", "x_max")  # Tensors of a weights file that hold scaler and ranges
 FAR = 5.0  # Scales from the mean beyond which an input is outside if the training range is unknown
+MANY = 0.05  # Share of readings outside the training range from which that is told
+WORST = 3  # Inputs that are named
 _BLOCK = 512  # Rows compared at once, to stay in the cache of a core
 
 
@@ -94,6 +96,28 @@ class Inputs(Summarized):
             block = x[start : start + _BLOCK]
             np.all((block >= low) & (block <= high), axis=1, out=inside[start : start + _BLOCK])
         return ~inside
+
+    def worst(self, x: ArrayLike) -> str:
+        """The inputs that most rows have outside of the training range; "" if at most `MANY` rows have.
+
+        Each with the value that is furthest outside, and the range.
+        """
+        x = self.checked(x)
+        low, high = self.within
+        beyond = np.maximum(np.maximum(low - x, x - high), 0) / np.where(high > low, high - low, 1.0)
+        rows = np.count_nonzero((beyond > 0).any(axis=1) | np.isnan(x).any(axis=1))
+        if rows <= MANY * len(x):
+            return ""
+        shares = np.mean((beyond > 0) | np.isnan(x), axis=0)
+        named = []
+        for k in np.argsort(-shares, kind="stable")[:WORST].tolist():
+            if shares[k] > 0:
+                row = int(np.nanargmax(np.where(np.isnan(beyond[:, k]), -1.0, beyond[:, k])))
+                value, ends = x[row, k], f"{low[k]:.3g} to {high[k]:.3g}"
+                named.append(f"{self.features[k]} {value:.3g} (trained on {ends}) in {shares[k]:.0%}")
+        return (
+            f"{rows / len(x):.0%} of {len(x):,} readings are outside the training range: {', '.join(named)}"
+        )
 
 
 def inputs_of(x: ArrayLike, features: str | Sequence[str]) -> Inputs:

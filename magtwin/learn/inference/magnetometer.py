@@ -2,16 +2,18 @@
 
 import math
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, MismatchWarning
 from magtwin.files import file
 from magtwin.files.kinds import expected
 from magtwin.learn.data.features import columns_of, features
+from magtwin.learn.data.inputs import MANY
 from magtwin.learn.data.origin import same_robot
 from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.predictor import Predictor, load_predictor
@@ -155,6 +157,8 @@ class NeuralMagnetometer(Summarized):
             mean, sd = self.net.predict(x)
             wide = None if own else self.net.wide_sd_nt(x)
             flags = self.net.outside(x) if outside else None
+            if flags is not None and flags.mean() > MANY:
+                warnings.warn(self.net.inputs.worst(x), MismatchWarning, stacklevel=3)
             made.append(Read(mean, sd, flags, wide, self._intervals(own, wide is not None)))
         return made
 

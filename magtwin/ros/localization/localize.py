@@ -31,7 +31,7 @@ from magtwin.io.bags.topics import (
     map_to_odom,
     transform_fields,
 )
-from magtwin.io.bags.unit import unit_of
+from magtwin.io.recording.unit import unit_of
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import Array, Localizer, Prior, Problem, Reading
 from magtwin.localization.track import LocalizerError, checked_estimates

@@ -4,11 +4,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.frames import quat_multiply, rotate, yaw_from_quat
-from magtwin.io.bags.bag import Bag, Signal
-from magtwin.io.bags.cdr import NS
-from magtwin.io.bags.frames import plain
-from magtwin.io.bags.topics import TF, TF_STATIC
 from magtwin.run.resample import linear, quaternion
 
 Array = NDArray[np.float64]
@@ -19,45 +14,8 @@ GAP = 5.0
 LEAST_GAP_S = 0.1
 """Poses closer than this are always interpolated between [s]."""
 
-MOVED_M, MOVED_RAD = 0.001, 0.002
-"""Correction of odometry by transforms below which there is none [m], [rad]."""
-
 UNIT_WITHIN = 0.01
 """Largest error of the length of a quaternion."""
-
-
-def corrected(bag: Bag, odometry: Signal) -> tuple[Signal, str] | None:
-    """Odometry in the frame against which transforms of the bag move its own, and how; None if none do.
-
-    With map to odom of a localizer or SLAM, p_map_base = p_map_odom + rotate(q_map_odom, p_odom_base).
-    Between transforms it is interpolated, and beyond them it is the nearest one.
-    """
-    frame = bag.frames(odometry)[0]
-    found: dict[str, list[tuple[int, Array]]] = {}
-    for each in bag.transforms(TF.name, TF_STATIC.name) if frame else ():
-        for row, child in enumerate(each.children):
-            if plain(child) == frame:
-                pose = np.append(each.p[row], each.q_xyzw[row])
-                found.setdefault(plain(each.parents[row]), []).append((int(each.stamps[row]), pose))
-    if len(found) != 1 or odometry.stamps is None:
-        return None
-    ((parent, moves),) = found.items()
-    ns, first = np.unique([stamp for stamp, _ in moves], return_index=True)
-    pose = np.array([moves[row][1] for row in first])
-    if len(ns) == 1:
-        ns, pose = np.append(ns, ns + NS), np.repeat(pose, 2, axis=0)
-    # from the first stamp, so that a float holds the times to the nanosecond
-    p, q, _ = poses_at((odometry.stamps - ns[0]) / NS, (ns - ns[0]) / NS, pose)
-    far = float(np.hypot(p[:, 0], p[:, 1]).max())
-    turn = float(np.abs(yaw_from_quat(q)).max())
-    if not (far > MOVED_M or turn > MOVED_RAD):
-        return None
-    leaves = [f"pose.pose.{leaf}" for leaf in ("position", "orientation")]
-    p_odom, q_odom = (odometry.fields[leaf] for leaf in leaves)
-    moved = dict(zip(leaves, (p + rotate(q, p_odom), quat_multiply(q, q_odom)), strict=True))
-    by = f"by up to {far:.3g} m and {np.degrees(turn):.3g} deg"
-    text = f"{odometry.name} from {frame!r:.40} to {parent!r:.40}, by {TF.name} ({by})"
-    return odometry._replace(fields={**odometry.fields, **moved}), text
 
 
 def poses_at(t: Array, pose_t: Array, pose: Array) -> tuple[Array, Array, NDArray[np.bool_]]:

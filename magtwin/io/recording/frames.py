@@ -6,19 +6,26 @@ as a camera, becomes the pose of base_link. Frames are named as in REP 105.
 """
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any, NamedTuple
+from xml.etree.ElementTree import ParseError, fromstring
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.frames import IDENTITY_XYZW, matrix_from_quat, quat_conjugate, quat_multiply, rotate
+from magtwin.frames import (
+    IDENTITY_XYZW,
+    matrix_from_quat,
+    quat_conjugate,
+    quat_from_rpy,
+    quat_multiply,
+    rotate,
+)
 from magtwin.io.bags.cdr import Index, Leaf, Messages, decode
-from magtwin.io.bags.topics import TF
-from magtwin.io.bags.types import layout
+from magtwin.io.recording.roles import Role
 
 Array = NDArray[np.float64]
 Columns = Mapping[str, NDArray[Any]]
@@ -53,38 +60,6 @@ _TRANSFORM = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Role:
-    """Columns of a kind of message, by what a change of frame does to them."""
-
-    noun: str
-    position: str = ""
-    """Position of the child frame in the frame of the header, which does not move."""
-
-    orientation: str = ""
-    """Orientation of the child frame; without `position`, of the frame of the header in the world."""
-
-    twist: tuple[str, ...] = ()
-    """Linear and angular velocity in the child frame."""
-
-    vectors: tuple[str, ...] = ()
-    """Vectors in the frame of the header, which is a part of the robot."""
-
-
-ROLES = (
-    Role(noun="pose", position="mocap_p", orientation="mocap_q_xyzw"),
-    Role(noun="odometry", position="odom_p", orientation="odom_q_xyzw", twist=("odom_v", "odom_w")),
-    Role(noun="IMU", orientation="imu_q_xyzw", vectors=("imu_w", "imu_a")),
-    Role(noun="field", vectors=("magnetic_field",)),
-)
-"""Roles of messages. A magnitude and the times of scans, which is all that is read of them, have no axes."""
-
-
-def role_of(columns: Iterable[str]) -> Role | None:
-    """The role of messages of some columns; None if no column depends on a frame."""
-    return next((r for r in ROLES if {r.position or r.vectors[0]} & set(columns)), None)
-
-
 class Mount(NamedTuple):
     """A frame at rest on the robot."""
 
@@ -109,7 +84,7 @@ class Mount(NamedTuple):
 
 @dataclass
 class StaticFrames:
-    """The transforms of /tf_static."""
+    """Transforms that do not change: those of /tf_static, and of a robot's description."""
 
     parents: dict[str, tuple[str, Array, Array]] = field(default_factory=dict)
     """By frame: its parent, its origin [m] and its axes (xyzw) there."""
@@ -119,6 +94,20 @@ class StaticFrames:
         size = float(np.linalg.norm(q_xyzw))
         if np.isfinite([*p, *q_xyzw]).all() and abs(size - 1) < 0.1:
             self.parents[plain(child)] = plain(parent), np.asarray(p, float), np.asarray(q_xyzw, float) / size
+
+    def describe(self, urdf: str) -> None:
+        """Take the fixed joints of a description, where /tf_static has none; those of no damaged one."""
+        try:
+            joints = [] if "<!" in urdf.replace("<!--", "") else fromstring(urdf).findall("joint")
+            for joint in joints:
+                parent, child, origin = map(joint.find, ("parent", "child", "origin"))
+                if joint.get("type") == "fixed" and parent is not None and child is not None:
+                    told = {} if origin is None else origin.attrib
+                    xyz, rpy = (np.array(told.get(key, "0 0 0").split(), float) for key in ("xyz", "rpy"))
+                    if plain(name := child.get("link", "")) not in self.parents and len(xyz) == len(rpy) == 3:
+                        self.add(parent.get("link", ""), name, xyz, quat_from_rpy(rpy))
+        except (ParseError, ValueError):
+            return
 
     def mount(self, frame: str) -> Mount | None:
         """Where a frame is on the robot; None if that is not known.
@@ -193,7 +182,10 @@ def mount_of(role: Role, frames: Frames, known: StaticFrames) -> tuple[Mount | N
         return None, ""
     mount = known.mount(part)
     if mount is None and kind_of(part) == "part":
-        return None, f"it is the pose of {part!r:.40}, and no /tf_static has the way from base_link to there"
+        return (
+            None,
+            f"it is the pose of {part!r:.40}, and no tree of frames has the way from base_link to there",
+        )
     return mount, ""
 
 
@@ -238,13 +230,13 @@ def _of_base(given: Array, turned: Array, a_base: Array) -> bool:
     return len(up) > 0 and bool(up.mean() > TILTED_M_S2)
 
 
-def frames_of(messages: Messages, kind: str) -> Frames:
-    """The frames of the messages of a topic.
+def frames_of(leaves: Iterable[Leaf], messages: Messages) -> Frames:
+    """The frames of the messages of a topic, whose type has some leaves.
 
     Raises:
         InputError: They have several frames.
     """
-    leaves = layout(kind)
+    leaves = tuple(leaves)
     wanted = [leaf.name for leaf in leaves if leaf.name in LEAVES]
     names = decode(leaves, messages, wanted)
     each = [sorted({plain(name) for name in names.get(leaf, ())} - {""}) for leaf in LEAVES]
@@ -266,12 +258,12 @@ class Transform(NamedTuple):
     q_xyzw: Array
 
 
-def transforms(messages: Messages) -> Iterator[Transform]:
+def transforms(messages: Messages, layout: Callable[[dict[str, int]], Iterable[Leaf]]) -> Iterator[Transform]:
     """The transforms of TFMessages, those of the same place in messages of the same length at a time."""
     counts = decode([Leaf("transforms", "u4")], messages, ["transforms"])["transforms"]
     for count in np.unique(counts[counts <= MOST_TRANSFORMS]).tolist():
         some = messages.take(np.flatnonzero(counts == count))
         names = [[f"transforms.{k}.{leaf}" for leaf in _TRANSFORM] for k in range(count)]
-        fields = decode(layout(TF.kind, {"transforms": count}), some, chain(*names))
+        fields = decode(tuple(layout({"transforms": count})), some, chain(*names))
         for each in names:
             yield Transform(*(fields[name] for name in each))

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, RepairWarning
-from magtwin.field.units import LEAST_USUAL_NT, MOST_USUAL_NT, NT_PER, Unit, check_unit, nt_per
+from magtwin.field.units import INDOORS_NT, LEAST_USUAL_NT, MOST_USUAL_NT, NT_PER, USUAL_NT, Unit, nt_per
 
 Array = NDArray[np.float64]
 
@@ -32,12 +32,19 @@ class Field(NamedTuple):
 
 
 def field_nt(
-    b: Array, where: str, topic: str, *, unit: Unit | None = None, scale: float | None = None
+    b: Array,
+    where: str,
+    topic: str,
+    *,
+    unit: Unit | None = None,
+    scale: float | None = None,
+    standard: bool = True,
 ) -> Field:
     """The field of messages in nT.
 
-    A median up to twice too large or too small for the Earth's field is taken with a warning: it may be that
-    of iron near the sensor. Up to ten times is taken if the unit is given.
+    A unit or scale that is given counts, with a warning if the median is not that of the Earth's field. A
+    guess warns, unless it is the tesla of messages of a standard type. By a guess, a median up to twice too
+    large or too small is taken: it may be that of iron near the sensor.
 
     Args:
         b: Magnitudes, shape (N,), or vectors, shape (N, 3). Vectors whose y and z are all 0 are magnitudes in
@@ -46,9 +53,11 @@ def field_nt(
         topic: The topic, for refusals.
         unit: Their unit. Default: the unit that makes their median the Earth's field.
         scale: Factor to nT, in place of a unit.
+        standard: Whether their type is one of ROS whose unit is T.
 
     Raises:
-        InputError: The median cannot be the Earth's field, or no message holds a number.
+        InputError: No unit was given and none makes the median that of the Earth's field, or no message holds
+            a number.
     """
     vector = b if b.ndim == 2 and np.any(b[:, 1:] != 0) else None
     size = np.abs(b if b.ndim == 1 else b[:, 0]) if vector is None else np.linalg.norm(b, axis=1)
@@ -62,13 +71,17 @@ def field_nt(
         unit = unit or unit_of(float(np.median(finite)), where, topic)
     factor = nt_per(unit, scale)
     usual = factor * float(np.median(finite))
-    if unit and not _is_earths(usual) and _is_earths(usual, IRON):
-        doubt = f"the median of {topic} is {usual:,.0f} nT in {unit}, not that of the Earth's field"
-    else:
-        doubt = check_unit(factor * finite, where, topic, unit or "nT", scale=scale, told=told)
+    doubt = ""
+    if not _is_earths(usual):
+        of = f"in {unit}" if unit else f"with the scale {scale:g}"
+        doubt = f"the median of {topic} is {usual:,.0f} nT {of}, not that of the Earth's field"
+        doubt += ": iron near the sensor, or another unit (--unit, --scale)"
+    elif not told and not (standard and unit == "T"):
+        doubt = f"{topic} is taken as {unit} by its size, as that gives {usual:,.0f} nT (--unit)"
+        if not INDOORS_NT[0] <= usual <= INDOORS_NT[1]:
+            doubt += "; for a normalised sensor give --scale, the factor to nT"
     if doubt:
-        text = f"{where}: {doubt}: iron near the sensor, or another unit (--unit, --scale)"
-        warnings.warn(text, RepairWarning, stacklevel=3)
+        warnings.warn(f"{where}: {doubt}", RepairWarning, stacklevel=3)
     label = unit or f"units of {scale:g} nT"
     text = f"{np.count_nonzero(zero)} of {len(b)} messages of {topic} as missing, which are 0"
     return Field(factor * size, None if vector is None else factor * vector, label, text * bool(zero.any()))
@@ -83,7 +96,11 @@ def unit_of(usual: float, where: str, topic: str) -> Unit:
         for unit, factor in NT_PER.items():
             if _is_earths(usual * factor, apart):
                 return unit  # type: ignore[return-value]
-    raise InputError(f"{where}: the median of {topic} is {usual:.6g}; in no unit is that the Earth's field")
+    scale = f"({USUAL_NT / usual:.4g} would make it {USUAL_NT:,.0f} nT)" if usual > 0 else ""
+    raise InputError(
+        f"{where}: the median of {topic} is {usual:.6g}; in no unit is that the Earth's field: give --unit, "
+        f"or for a normalised sensor --scale, the factor to nT {scale}"
+    )
 
 
 def _is_earths(usual_nt: float, apart: float = 1.0) -> bool:

@@ -1,0 +1,72 @@
+"""ros1: bags of ROS 1 (.bag), read by rosbags; their messages are decoded like those of ROS 2."""
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magtwin.files.budget import check_decoded
+from magtwin.io.bags.cdr import Index, Messages
+from magtwin.io.bags.storage import StoredTopic
+
+_NOW = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
+"""Types that have another name today."""
+
+
+class Ros1Reader:
+    """A .bag file: its topics, and its messages on demand; attributes as those of `McapReader`."""
+
+    whole = True
+    damaged = frozenset[int]()
+
+    def __init__(self, path: Path) -> None:
+        from rosbags.rosbag1 import Reader
+
+        self._path, self._size = path, path.stat().st_size
+        self._bag: Any = Reader(path)
+        self._bag.open()
+        self.notes: dict[str, str] = {}
+        self.topics, self.definitions = [], {}
+        for connection in self._bag.connections:
+            kind = _NOW.get(connection.msgtype, connection.msgtype)
+            latching = getattr(connection.ext, "latching", 0)
+            latched = "durability: transient_local" if latching else ""
+            self.topics.append(StoredTopic(connection.id, connection.topic, kind, "ros1", latched))
+            self.definitions[kind] = "ros1msg", connection.msgdef.data
+        self.chunks = len(self._bag.chunks)
+        self.compression = {_name(chunk.decompressor) for chunk in self._bag.chunks.values()}
+
+    def close(self) -> None:
+        """Close the bag."""
+        self._bag.close()
+
+    def times(self) -> dict[int, Index]:
+        """Times of receipt of the messages of each topic [ns], from its index."""
+        return {
+            k: np.array([entry.time for entry in each], np.int64) for k, each in self._bag.indexes.items()
+        }
+
+    def messages(self, ids: Collection[int], most: int | None = None) -> dict[int, Messages]:
+        """The messages of some topics in the order of receipt; of about the first `most` bytes."""
+        parts: dict[int, list[tuple[int, bytes]]] = {number: [] for number in ids}
+        chosen, held = [each for each in self._bag.connections if each.id in parts], 0
+        for connection, received, data in self._bag.messages(chosen) if chosen else ():
+            held += len(data)
+            check_decoded(self._path, self._size, held)
+            if most is not None and held > most:
+                break
+            parts[connection.id].append((received, data))
+        joined = {}
+        for number, rows in parts.items():
+            size = np.array([len(data) for _, data in rows], np.int64)
+            moments = np.array([received for received, _ in rows], np.int64)
+            buffer = np.frombuffer(b"".join(data for _, data in rows), np.uint8)
+            joined[number] = Messages(moments, buffer, np.cumsum(size) - size, size, packed=True).in_order()
+        return joined
+
+
+def _name(decompressor: Any) -> str:
+    """Name of the compression of a chunk."""
+    text = f"{getattr(decompressor, '__module__', '')}.{getattr(decompressor, '__qualname__', '')}".lower()
+    return next((name for name in ("bz2", "lz4") if name in text), "")

@@ -1,0 +1,1 @@
+"""Recordings: what a robot recorded, as roles, frames and one timeline."""

@@ -1,0 +1,139 @@
+"""Tree: the frames of a recording, by /tf, /tf_static and the robot's description."""
+
+from contextlib import suppress
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.errors import InputError
+from magtwin.frames import IDENTITY_XYZW, quat_multiply, rotate
+from magtwin.io.bags.bag import Bag
+from magtwin.io.bags.cdr import NS, Index, decode
+from magtwin.io.bags.topics import DESCRIPTION, TF, TF_STATIC
+from magtwin.io.recording.frames import StaticFrames, Transform, kind_of, plain, transforms
+from magtwin.io.recording.poses import poses_at
+
+Array = NDArray[np.float64]
+
+STILL = 1e-9
+"""Largest change of a transform on /tf that does not move [m] and parts of a quaternion."""
+
+MOST_DESCRIPTION = 4_000_000
+"""Longest description that is read [characters]."""
+
+
+class Tree:
+    """The frames of a bag.
+
+    Attributes:
+        static: Transforms that do not change; also those of /tf that never do.
+        moving: By frame: its parent, the stamps [ns], and its origin and axes (xyzw) there, shape (M, 7).
+    """
+
+    def __init__(self, bag: Bag, most: int | None = None) -> None:
+        self.static = StaticFrames()
+        self.moving: dict[str, tuple[str, Index, Array]] = {}
+        ends = {TF.name: TF.kind, TF_STATIC.name: TF.kind, "robot_description": DESCRIPTION.kind}
+        pairs = [(name, end) for name in bag.kinds for end in ends if name.endswith(end)]
+        names = {name: end for name, end in pairs if bag.kinds[name] == ends[end]}
+        edges: dict[tuple[str, str], list[tuple[Index, Array]]] = {}
+        with np.errstate(over="ignore", invalid="ignore"):
+            for name, messages in bag.messages(names, most).items():
+                with suppress(InputError):
+                    if names[name] not in (TF.name, TF_STATIC.name):
+                        for text in decode(bag.layout(name), messages, ["data"])["data"][-1:]:
+                            self.static.describe(text[:MOST_DESCRIPTION])
+                        continue
+                    for each in transforms(messages, partial(bag.layout, name)):
+                        if name.endswith(TF_STATIC.name):
+                            for row in zip(each.parents, each.children, each.p, each.q_xyzw, strict=True):
+                                self.static.add(*row)
+                        else:
+                            _collect(each, edges)
+        for (parent, child), parts in edges.items():
+            self._move(parent, child, *(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def _move(self, parent: str, child: str, ns: Index, pose: Array) -> None:
+        """Take the transforms of an edge; of several parents, that of most transforms counts."""
+        ns, first = np.unique(ns, return_index=True)
+        pose = pose[first]
+        if kind_of(parent) != "fixed" and np.ptp(pose, axis=0).max(initial=0) < STILL:
+            if child not in self.static.parents:
+                self.static.add(parent, child, pose[0, :3], pose[0, 3:])
+        elif child not in self.moving or len(self.moving[child][1]) < len(ns):
+            self.moving[child] = parent, ns, pose
+
+    def up(self, frame: str) -> list[str]:
+        """A frame and those above it, up to the root of its tree."""
+        way = [plain(frame)]
+        while (parent := self._parent(way[-1])) and parent not in way:
+            way.append(parent)
+        return way
+
+    def _parent(self, frame: str) -> str:
+        return self.moving[frame][0] if frame in self.moving else self.static.parents.get(frame, ("",))[0]
+
+    def at(self, frame: str, ns: Index) -> tuple[Array, Array]:
+        """Origin [m] and axes (xyzw) of a frame in the root of its tree, shape (M, 3) and (M, 4).
+
+        p_root = p + rotate(q, p_child) and q_root = q q_child for each edge upwards. Between transforms it is
+        interpolated, and beyond them the nearest one counts.
+
+        Args:
+            frame: The frame.
+            ns: Times [ns], shape (M,).
+        """
+        p, q = np.zeros((len(ns), 3)), np.tile(IDENTITY_XYZW, (len(ns), 1)).astype(float)
+        for name in self.up(frame)[:-1]:
+            if name in self.moving:
+                _, times, pose = self.moving[name]
+                if len(times) == 1:
+                    times, pose = np.append(times, times + NS), np.repeat(pose, 2, axis=0)
+                # from the first stamp, so that a float holds the times to the nanosecond
+                p_here, q_here, _ = poses_at((ns - times[0]) / NS, (times - times[0]) / NS, pose)
+            else:
+                _, p_here, q_here = self.static.parents[name]
+            p, q = p_here + rotate(q_here, p), quat_multiply(q_here, q)
+        return p, q
+
+    def base(self, near: str = "") -> str:
+        """The robot's base, whose pose moves in a frame that stands still; "" if there is none.
+
+        Args:
+            near: A frame on the robot, which decides between several robots.
+
+        Raises:
+            InputError: There are several robots.
+        """
+        names = {*self.moving, *self.static.parents}
+        found = [name for name in names if kind_of(name) == "base" and self._moves(name)]
+        if near:
+            found = [
+                name for name in found if set(self.up(near)) & set(self.up(name)) & {*self.moving}
+            ] or found
+        for rank in ("base_link", "base_footprint", ""):
+            if best := sorted(name for name in found if name.endswith(rank)):
+                if len(best) > 1 and rank:
+                    raise InputError(
+                        f"/tf has {len(best)} robots, {', '.join(best)[:200]}; record one of them"
+                    )
+                return best[0]
+        return ""
+
+    def _moves(self, name: str) -> bool:
+        way = self.up(name)
+        return kind_of(way[-1]) == "fixed" and any(each in self.moving for each in way)
+
+    def stamps(self, frame: str) -> Index:
+        """Times of the transforms of the edge above a frame that has most [ns]."""
+        return max((self.moving[name][1] for name in self.up(frame) if name in self.moving), key=len)
+
+
+def _collect(each: Transform, edges: dict[tuple[str, str], list[tuple[Index, Array]]]) -> None:
+    """Put transforms of messages to those of their edge."""
+    pose = np.concatenate([each.p, each.q_xyzw], axis=1)
+    ends = list(zip(map(plain, each.parents), map(plain, each.children), strict=True))
+    for pair in dict.fromkeys(ends):
+        rows = slice(None) if len(set(ends)) == 1 else [k for k, other in enumerate(ends) if other == pair]
+        edges.setdefault(pair, []).append((each.stamps[rows], pose[rows]))
