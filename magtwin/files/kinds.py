@@ -191,8 +191,8 @@ def shipped_or(file: str | Path) -> Path:
 
     A file goes before a shipped scene of its name, and so does a folder of a known kind.
     """
-    path = Path(file)
-    stage, kind = _shipped_stages().get(str(file)), kind_of(path) if path.is_dir() else None
+    path, stage = Path(file), _shipped_stages().get(str(file))
+    kind = kind_of(path) if stage is not None or not path.suffix else None
     if kind in (SCENE_FOLDER, ROBOT_FOLDER):
         return path / f"{path.resolve().name}.usda"
     return path if stage is None or path.is_file() or kind else stage
