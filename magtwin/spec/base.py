@@ -83,7 +83,8 @@ class Spec:
         many = list(value) if isinstance(value, list | tuple) and width != ONE else [value]
         fits = width in (ANY, len(many)) or (width == ONE and not isinstance(value, list | tuple))
         fits = fits and all(isinstance(x, int | float) and not isinstance(x, bool) for x in many)
-        what = {ONE: "be a number", ANY: "be numbers"}.get(width, f"be {width} numbers")
+        one = "be a number" if kind is float else "be a whole number"
+        what = {ONE: one, ANY: "be numbers"}.get(width, f"be {width} numbers")
         self._require(name, fits and (kind is float or all(x == int(x) for x in many)), what, given)
         many = [kind(x) for x in many]
         value = many[0] if width == ONE else tuple(many)
