@@ -227,13 +227,13 @@ def test_the_folder_of_a_sweep_becomes_a_grid_of_stills_that_open_pages(run, lab
 
 
 def test_a_scene_of_many_shapes_keeps_its_robot_and_its_largest_ones_and_says_so(run, lab_scene, monkeypatch):
-    monkeypatch.setattr("magtwin.figures.bodies.MOST_TRIANGLES", 3_000)
+    monkeypatch.setattr("magtwin.figures.bodies.MOST_TRIANGLES", 1_000)
     player = player_of([run], None, lab_scene)
     head, arrays = unpacked(player.block)
     assert re.search(r"\d+ small shapes of the scene are left out", player.note)
     names = [body["name"] for body in head["bodies"]]
     assert {"lab", "0/"} <= set(names)
-    assert sum(len(arrays[f"{name}.faces".removeprefix("0/")]) for name in names) <= 3 * 3_000
+    assert sum(len(arrays[f"{name}.faces".removeprefix("0/")]) for name in names) <= 3 * 1_000
 
 
 def test_without_webgl_a_page_has_its_charts_and_a_picture(run, twin, lab_scene, tmp_path):
