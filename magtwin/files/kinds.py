@@ -54,7 +54,10 @@ DATASET = Kind(
     "a data set", "magtwin train {file} --out F.safetensors and magtwin dataset info {file} take it"
 )
 RESULTS = Kind("a folder of results", "magtwin bench report {file} takes it")
-WEIGHTS = Kind("a network", "magtwin info {file} describes it, and magtwin evaluate and --network take it")
+WEIGHTS = Kind(
+    "a network",
+    "magtwin info {file} describes it; magtwin evaluate and magtwin run SCENE --network {file} take it",
+)
 ONNX = Kind("a network as ONNX, which runs without magtwin", "give its .safetensors or .pth")
 CHECKPOINT = Kind("a PyTorch checkpoint", "magtwin model convert {file} --out F.safetensors converts it")
 PATH = Kind("a path", "magtwin run SCENE --path {file} drives it")
@@ -158,7 +161,7 @@ def expected(path: str | os.PathLike[str], noun: str) -> Path:
 def scene_file(scene: str | Path) -> Path:
     """The file of a stage, of a folder that `author_scene` wrote, or of a shipped scene's name such as "lab".
 
-    A folder goes before a shipped scene of its name only if it holds a scene. `./lab` is always the folder.
+    A folder goes before a shipped scene of its name only if it holds a scene.
 
     Raises:
         InputError: The file is missing, there is no scene of that name, or it is a TOML.

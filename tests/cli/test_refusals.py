@@ -119,12 +119,3 @@ def test_a_command_is_refused_in_one_line_and_leaves_nothing(command, words, odd
     assert all(word in line for word in words), line
     assert ".new" not in line  # the place aside is no concern of the user's
     assert sorted(os.listdir()) == before
-
-
-@pytest.mark.parametrize("words", [["rnu"], ["run"], ["run", "a.usda", "--sped", "1"]])
-def test_wrong_usage_exits_with_2(words, capsys):
-    from magtwin.cli import main
-
-    with pytest.raises(SystemExit) as stop:
-        main(words)
-    assert stop.value.code == 2

@@ -1,51 +1,43 @@
 """Names of commands: groups, other words for them, old names, examples, and what is said of a wrong name."""
 
+import ast
 import re
 import shlex
+from pathlib import Path
 
 import pytest
+from test_options import _names, commands
 
+import magtwin
 from magtwin.cli import MODULES, load, main
 from magtwin.cli.app import app
 from magtwin.cli.help import _examples, examples, front
 from magtwin.cli.words import GROUPS, OLD, as_of_today, guess, option_meant
 
 load()
-MEANT = {
-    "run": "simulate sim simulation drive-path simulate-robot physics runSim",
-    "plot": "draw image images charts graph video movie animate screenshot plot-map plotmap make-video",
-    "view": "open show visualize visualise gui watch show-run",
-    "info": "list ls describe inspect cat metadata",
-    "robot": "urdf2usd import-urdf urdf-to-usd robot2usd usd2urdf convert-robot xacro urdftousd",
-    "scene": "make-scene create-room furniture add-furniture",
-    "validate": "test check lint verify usdchecker valdate check-scene",
-    "doctor": "install setup config env check-install",
-    "bench": "benchmark leaderboard bechmark benchmark-localizers",
-    "localize": "slam localization locate estimate-pose particle-filter",
-    "train": "learn train-model trian neural fit-network",
-    "evaluate": "predict score eval test-model accuracy",
-    "convert": "bag2csv to-csv import-bag mcap export-csv",
-    "export": "usdz glb isaac omniverse package export-scene",
-    "fetch": "download get-data",
-    "sweep": "batch monte-carlo grid-search",
-    "drive": "teleop joystick keyboard",
-    "demo": "example quickstart tutorial",
-    "new": "init create template",
-    "report": "html summary dashboard",
-    "map fit": "fit map-fit mapfit make-map interpolate kriging fit-map",
-    "map survey": "survey scan map-survey",
-    "map diff": "compare-maps",
-    "dataset build": "dataset-build build-dataset label preprocess",
-    "model calibrate": "calibration hard-iron",
-    "model compensate": "tolles-lawson tolles_lawson",
-    "model export": "onnx export-model",
-    "reproduce": "repeat reproducibility",
-    "ros replay": "replay playback",
-    "help": "man docs help-me",
-}
+MEANT = """
+run: simulate sim simulation drive-path simulate-robot physics runSim; plot: draw image images charts graph
+video movie animate screenshot plot-map plotmap make-video; view: open show visualize visualise gui watch
+show-run; info: list ls describe inspect cat metadata; robot: urdf2usd import-urdf urdf-to-usd robot2usd
+usd2urdf convert-robot xacro urdftousd; scene: make-scene create-room furniture add-furniture; validate:
+test check lint verify usdchecker valdate check-scene; doctor: install setup config env check-install;
+bench: benchmark leaderboard bechmark benchmark-localizers; localize: slam localization locate estimate-pose
+particle-filter; train: learn train-model trian neural fit-network; evaluate: predict score eval test-model
+accuracy; convert: bag2csv to-csv import-bag mcap export-csv; export: usdz glb isaac omniverse package
+export-scene; fetch: download get-data; sweep: batch monte-carlo grid-search; drive: teleop joystick
+keyboard; demo: example quickstart tutorial; new: init create template; report: html summary dashboard; map
+fit: fit map-fit mapfit make-map interpolate kriging fit-map; map survey: survey scan map-survey; map diff:
+compare-maps; dataset build: dataset-build build-dataset label preprocess; model calibrate: calibration
+hard-iron; model compensate: tolles-lawson tolles_lawson; model export: onnx export-model; reproduce: repeat
+reproducibility; ros replay: replay playback; help: man docs help-me
+"""
+"""Commands, and words that lead to them."""
 
 
-@pytest.mark.parametrize(("command", "word"), [(c, w) for c, text in MEANT.items() for w in text.split()])
+PAIRS = [line.split(": ") for line in " ".join(MEANT.split()).split("; ")]
+
+
+@pytest.mark.parametrize(("command", "word"), [(n, w) for n, words in PAIRS for w in words.split()])
 def test_an_everyday_word_leads_to_its_command(command, word):
     assert command in guess(word)
 
@@ -78,6 +70,7 @@ def test_every_command_is_in_a_group_and_the_first_page_fits_a_terminal():
         ("create scene", "did you mean `magtwin scene`: Author"),
         ("map draw", "no command 'map draw'; did you mean `magtwin plot`"),
         ("dataset make", "did you mean `magtwin dataset build`"),
+        ("rnu", "did you mean `magtwin run`"),
         ("xyzzy", "no command 'xyzzy'; magtwin help lists"),
         ("gone/run.parquet", "no such file"),
         ("run", "magtwin run needs SCENE: USD stage to drive in"),
@@ -139,3 +132,23 @@ def test_each_command_has_two_examples_and_quick_ones_work_in_an_empty_folder(tm
     assert (tmp_path / "again.usdc").exists()
     assert option_meant("overwrite") == ["force"]
     assert all(len(examples(command)) == 2 for command in MODULES)
+
+
+FLAG = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]+")
+OTHERS = (
+    "--allow --debug --help --version --json-output --output --verify --src --dst --unordered --bind --port "
+)
+OTHERS += "--web-viewer --hide-welcome-screen --headless --window-size --time-s --quantity"
+
+
+def test_an_option_that_a_message_names_is_one_of_its_command():
+    options = {" ".join(words): _names(group) | set(OTHERS.split()) for words, group in commands()}
+    for file in Path(magtwin.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            parts = node.values if isinstance(node, ast.JoinedStr) else [node]
+            text = "".join(str(getattr(part, "value", "X")) for part in parts if isinstance(part, ast.expr))
+            assert {*FLAG.findall(text)} <= set().union(*options.values()), (file, text)
+            for said in (re.split("[`;,)]", part)[0] for part in text.split("magtwin ")[1:]):
+                starts = (" ".join(said.split()[:k]) for k in (3, 2, 1))
+                known = next((start for start in starts if start in options), None)
+                assert known is None or {*FLAG.findall(said)} <= options[known], (file, said)
