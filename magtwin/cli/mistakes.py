@@ -1,7 +1,6 @@
 """Mistakes: what is said of a command line that was typed wrong, in one line with what to type."""
 
 import difflib
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -48,7 +47,8 @@ def unknown_command(word: str, group: str = "", more: Sequence[str] = ()) -> str
     from magtwin.cli.app import app
     from magtwin.files.kinds import kind_of
 
-    if not group and os.path.exists(word) and (kind := kind_of(Path(word))):
+    kind = None if group else kind_of(Path(word))
+    if kind and Path(word).exists():
         return f"no command {word!r}, which is {kind.noun}; {kind.remedy.format(file=word)}"
     if "/" in word or Path(word).suffix:
         return f"no command {word!r}, and no such file; magtwin help lists the commands"

@@ -192,11 +192,11 @@ def shipped_or(file: str | Path) -> Path:
 
     A file goes before a shipped scene of its name, and so does a folder of a known kind.
     """
-    path = Path(file)
-    stage, kind = _shipped_stages().get(str(file)), kind_of(path) if os.path.isdir(path) else None
+    path, stage = Path(file), _shipped_stages().get(str(file))
+    kind = kind_of(path) if stage is not None or not path.suffix else None
     if kind in (SCENE_FOLDER, ROBOT_FOLDER):
         return path / f"{path.resolve().name}.usda"
-    return path if stage is None or os.path.isfile(path) or kind else stage
+    return path if stage is None or path.is_file() or kind else stage
 
 
 def _shipped_stages() -> dict[str, Path]:

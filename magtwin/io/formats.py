@@ -209,7 +209,7 @@ def runs_in(path: Path) -> list[Path]:
     Raises:
         InputError: It has the runs.csv of `magtwin sweep` alone.
     """
-    if not os.path.isdir(path):
+    if not os.path.isdir(path):  # noqa: PTH112 - False of a name that is too long
         return [path]
     if kind_of(path) is SWEEP:
         inside = sorted(path.glob("run_*.parquet"))

@@ -36,7 +36,7 @@ def map_file(source: Source) -> Path:
         InputError: There is no such file or scene.
     """
     path = Path(source)
-    if os.path.exists(path):  # False of a name that is too long, which is refused below
+    if os.path.exists(path):  # noqa: PTH110 - False of a name that is too long, which is refused below
         return shipped_or(path)
     if path.suffix or (len(path.parts) > 1 and not path.exists()):
         return existing(path, "map")
