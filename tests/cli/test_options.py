@@ -138,5 +138,5 @@ def test_an_output_may_have_the_name_of_a_choice(lab_scene, tmp_path, monkeypatc
     ):
         with pytest.raises(SystemExit):
             main([*words, "--force"])
-        assert re.search("is read|would be removed|a run in", capsys.readouterr().err), words
+        assert re.search("is read|would be removed|plays no run", capsys.readouterr().err), words
         assert (tmp_path / "room" / room).is_file()

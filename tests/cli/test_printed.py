@@ -29,7 +29,7 @@ SHOWN = (
     "reproduce IN/run.parquet",
     "compare IN/run.parquet IN/run.parquet",
     "map diff IN/map.usdc IN/map.usdc",
-    "map validate IN/map.usdc --method trilinear --method cubic",
+    "map validate IN/survey --method trilinear --method cubic",
     "validate IN/room/room.usda --against core --out found.json",
     "bench compare IN/results IN/results",
     "doctor",

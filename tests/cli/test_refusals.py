@@ -15,7 +15,7 @@ REFUSALS = [
     (f"new {LONG}.toml", "305 characters is too long"),
     (f"convert run.npz {LONG}.csv", "too long for a file; shorten it"),
     (f"run {LONG}", "too long for a file; shorten it"),
-    (f"info {LONG}.usda", "File name too long"),
+    (f"info {LONG}.usda", "too long for a file; shorten it"),
     (f"new {BYTES}.toml", "its name is not UTF-8"),
     (f"convert run.npz {BYTES}.parquet", "its name is not UTF-8"),
     ("convert loop a.csv", "links form a circle"),
@@ -28,7 +28,7 @@ REFUSALS = [
     ("run lab --network gone.pth --out new", "no such"),
     # outputs
     ("convert run.npz page.html/new.csv", "page.html/new.csv: cannot be written"),
-    ("robot robot.urdf --out new.usdc", "new.usdc: a robot is a folder or one .usda; give new, or new.usda"),
+    ("robot robot.urdf --out new.usdc", "a robot is a folder, or one file .usda; give new, or new.usda"),
     ("run lab --out new.json", "new.json: a released package is read, not written"),
     ("convert run.npz new.json", "is read, not written"),
     ("run lab --out new.txt", "unknown format of a run"),

@@ -1,5 +1,7 @@
 """`magtwin report`, `compare` and `reproduce`."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -93,7 +95,9 @@ def reproduce(file: Path, *, scene: RunScene = None) -> Done:
 
     step("Reproducing the run")
     found = repeat_of(file, scene)
-    return Done(found.report(f"{file}, reproduced"), status=0 if found.equal else 1)
+    report = found.report(f"{file}, reproduced")
+    told, data = replace(report, metadata={}), json.loads(report.to_json())
+    return Done(told, lines=found.causes, data=data, status=0 if found.equal else 1)
 
 
 def _lines(comparison: "Comparison", names: tuple[str, str]) -> list[str]:
