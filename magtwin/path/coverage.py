@@ -58,7 +58,7 @@ def cover(free: Mask, strip: float) -> Coverage | None:
     main = int(np.argmax(sizes)) + 1
     region = labels == main
     both = [_lanes(region, strip), _lanes(region.T, strip)]
-    flip = len(both[1]) < len(both[0])
+    flip = sum(map(len, both[1])) < sum(map(len, both[0]))
     lanes = [[(a[::-1], b[::-1]) for a, b in cell] if flip else cell for cell in both[flip]]
     lanes += [[(point, point)] for point in _left_out(region, lanes, strip)]
     graph = _Graph(region)

@@ -218,8 +218,8 @@ def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> 
         raise InputError(
             f"path {path.name} runs into {obstacles.names[which[i]]}: {s[i]:.3f} m along it, at "
             f"({p[i, 0]:.3f}, {p[i, 1]:.3f}) m, a robot of radius {footprint_radius_m:g} m is "
-            f"{footprint_radius_m - distance[i]:.3f} m too near; {door}give `fit=True`, or move the path or "
-            "the obstacle"
+            f"{footprint_radius_m - distance[i]:.3f} m too near; {door}give `fit=True`, or move the "
+            "path or the obstacle"
         )
 
 
