@@ -26,8 +26,8 @@ def info(file: Path, *, recorded: RecordedOptions = RECORDED) -> Done:
     ----------
     file
         A run (.parquet, .rrd, .mcap, .db3, .bag, .csv, .npz, .usd, a .json of the released node, the folder
-        of a bag, of Parquet parts, or of magtwin run), a stage or a map (.usd, .usda, .usdc, .usdz), a folder of
-        survey CSVs (0_map.csv, ...), or a network (.safetensors, .pth, .onnx).
+        of a bag, of Parquet parts, or of magtwin run), a stage or a map (.usd, .usda, .usdc, .usdz), a folder
+        of survey CSVs (0_map.csv, ...), or a network (.safetensors, .pth, .onnx).
     """
     from magtwin.io.info import info_of
 
