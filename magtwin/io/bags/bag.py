@@ -72,6 +72,13 @@ class Bag:
                 self.readers.append(reader)
                 self._take(reader, about.kinds)
             self._opened = opened.pop_all()
+        try:
+            self._warn_of_faults()
+        except BaseException:  # a warning that is an error
+            self._opened.close()
+            raise
+
+    def _warn_of_faults(self) -> None:
         if not (all(reader.whole for reader in self.readers) or PARTIAL in self.path.name):
             text = "cut short: its end is missing; it is read up to its last whole chunk"
             warnings.warn(f"{self.path}: {text}", RepairWarning, stacklevel=2)

@@ -69,7 +69,7 @@ ROLES: Mapping[Topic, Role] = {
         kinds=(MAGNITUDE.kind, "px4_msgs/msg/VehicleMagnetometer", "px4_msgs/msg/SensorMag"),
         named="mag compass field bfield b_field tesla gauss qtfm",
         never="bias offset covariance calib heading hdg temp status std error gain declination image",
-        ranks=("magnitude total scalar norm", "*", "raw uncal"),
+        ranks=("magnitude total scalar", "*", "raw uncal"),
         option="--field-topic",
         vectors=("magnetic_field",),
     ),
