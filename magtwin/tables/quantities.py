@@ -110,7 +110,19 @@ _AT = frozenset(
 )
 _ON_EARTH = frozenset(("location", "gps", "gnss", "geo", "wgs84", "pos", "position", "decimal", "dd"))
 _READINGS = frozenset(
-    ("strength", "value", "reading", "raw", "sensor", "measured", "calibrated", "avg", "mean", "corrected")
+    (
+        "strength",
+        "value",
+        "reading",
+        "raw",
+        "sensor",
+        "measured",
+        "calibrated",
+        "avg",
+        "mean",
+        "corrected",
+        "cor",
+    )
 )
 _SENT = frozenset(("twist", "cmd", "vel", "msg", "data", "header"))
 _VECTORS = (
