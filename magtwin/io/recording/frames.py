@@ -35,7 +35,8 @@ Frames = tuple[str, str]
 LEAVES = ("header.frame_id", "child_frame_id")
 
 WORDS: Mapping[str, str] = {
-    "fixed": "map vision takeoff odom world earth enu ned utm origin local global vicon mocap optitrack qualisys qtm",
+    "fixed": "map vision takeoff odom world earth enu ned utm origin local global vicon mocap optitrack "
+    "qualisys qtm",
     "part": "camera cam optical imu gyro accel lidar laser scan rplidar velodyne depth radar sonar gps gnss "
     "mag magnetometer compass antenna sensor wheel",
     "base": "base footprint body chassis robot",
