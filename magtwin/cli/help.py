@@ -125,4 +125,4 @@ def _first(console: Any, text: Any) -> str:
 
 def first_sentence(text: str) -> str:
     """The first sentence of a text."""
-    return re.split(r"(?<=[^.][.])\s", " ".join(text.split()), maxsplit=1)[0]
+    return re.split(r"(?<=[^.][.])(?<! al\.)\s", " ".join(text.split()), maxsplit=1)[0]

@@ -172,8 +172,7 @@ def scene_file(scene: str | Path) -> Path:
             f"{scene}: describes a scene; author it first: {author}; then give its folder, "
             f"as in magtwin run {file.with_suffix('')}"
         )
-    inside = file / f"{file.resolve().name}.usda"
-    if inside.is_file():
+    if (inside := stage_in(file)).is_file():
         return inside
     stages = _shipped_stages()
     if str(scene) in stages and not file.is_file():
@@ -183,7 +182,20 @@ def scene_file(scene: str | Path) -> Path:
     if shipped("scenes").joinpath(f"{scene}.toml").is_file():
         author = f"magtwin scene {scene} --map MAP.usdc --out {scene}"
         raise InputError(f"{scene}: ships as a TOML without its map; author it first: {author}")
+    if file.with_suffix(".toml").is_file():
+        return scene_file(file.with_suffix(".toml"))
     return find("scene", str(scene), stages)
+
+
+def stage_in(folder: Path) -> Path:
+    """The stage of a folder: the one of its name; in a folder that was renamed, the one with a layer of its own.
+
+    A scene NAME is NAME.usda beside NAME_layer.usda; a robot is the only stage of its folder.
+    """
+    inside = folder / f"{folder.resolve().name}.usda"
+    stages = list(folder.glob("*.usda")) if folder.is_dir() and not inside.is_file() else []
+    whole = [stage for stage in stages if stage.with_name(f"{stage.stem}_layer.usda").is_file()] or stages
+    return whole[0] if len(whole) == 1 else inside
 
 
 def shipped_or(file: str | Path) -> Path:
@@ -194,7 +206,7 @@ def shipped_or(file: str | Path) -> Path:
     path, stage = Path(file), _shipped_stages().get(str(file))
     kind = kind_of(path) if stage is not None or not path.suffix else None
     if kind in (SCENE_FOLDER, ROBOT_FOLDER):
-        return path / f"{path.resolve().name}.usda"
+        return stage_in(path)
     return path if stage is None or path.is_file() or kind else stage
 
 
@@ -234,7 +246,7 @@ def _kind_of_folder(folder: Path) -> Kind | None:
         ("metadata.yaml", RUN),
         ("run.parquet", RUN),
         ("runs.csv", SWEEP),
-        (f"{folder.resolve().name}.usda", _kind_of_stages(folder)),
+        (stage_in(folder).name, _kind_of_stages(folder)),
     ):
         if (folder / name).is_file():
             return kind
