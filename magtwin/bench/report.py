@@ -158,13 +158,11 @@ def _verdict(every: Sequence[Standing]) -> str:
 
 def _figures(rows: Columns, every: Sequence[Standing]) -> list[tuple[str, str]]:
     """The benchmark in five figures."""
-    return [
-        ("runs", f"{len(rows['run']):,}"),
-        ("failed", f"{np.count_nonzero(rows['status'] != 'ok'):,}"),
-        ("localizers", f"{len({s.localizer for s in every}):,}"),
-        ("scenarios", f"{len({s.scenario for s in every}):,}"),
-        ("sessions", f"{len(np.unique(rows['session'])):,}"),
-    ]
+    failed, sessions = np.count_nonzero(rows["status"] != "ok"), len(np.unique(rows["session"]))
+    kinds = len({s.localizer for s in every}), len({s.scenario for s in every})
+    names = ("runs", "failed", "localizers", "scenarios", "sessions")
+    counts = (len(rows["run"]), failed, *kinds, sessions)
+    return [(name, f"{count:,}") for name, count in zip(names, counts, strict=True)]
 
 
 def _described(scenario: Scenario, here: Sequence[Standing], rows: Columns) -> str:
@@ -293,16 +291,7 @@ def _reliability(here: Sequence[Standing]) -> Table:
 
 def _differences(found: Sequence[Difference]) -> Table:
     rows = tuple(
-        (
-            d.scenario,
-            d.a,
-            d.b,
-            d.runs,
-            _difference(d.rmse_m),
-            f"{d.rmse_m.p:.3g}",
-            d.verdict,
-        )
-        for d in found
+        (d.scenario, d.a, d.b, d.runs, _difference(d.rmse_m), f"{d.rmse_m.p:.3g}", d.verdict) for d in found
     )
     head = ("scenario", "A", "B", "runs of both", "RMSE of A - B [m] (95 %)", "p", "verdict")
     return Table("Paired differences", head, rows, "Mean over runs; p by permutation of sessions.")

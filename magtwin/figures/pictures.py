@@ -622,14 +622,25 @@ def add_bar(plotter: Any, colour_map: str, limits: tuple[float, float], title: s
 class Cutaway:
     """Takes pictures of a plotter in which objects in front of the subject are a veil over it.
 
-    Each picture is drawn twice: whole, and with the subject alone on a transparent ground. The second is laid
-    over the first, so that walls, columns and cabinets stay solid where they hide nothing of the subject.
+    Each picture is drawn whole, and with the subject alone and the robot alone on a transparent ground, each
+    laid over the one before, so that all stays solid where it hides nothing of the subject.
     A camera below the floor sees the floor from below, without a cutaway.
     """
 
-    def __init__(self, plotter: Any, size: tuple[int, int], screens: Sequence[Any]) -> None:
-        """Prepare the pictures of a rendered plotter; `screens` are the actors that may hide the subject."""
-        self._plotter, self._size, self._screens = plotter, size, tuple(screens)
+    def __init__(
+        self, plotter: Any, size: tuple[int, int], screens: Sequence[Any], robot: Sequence[Any] = ()
+    ) -> None:
+        """Prepare the pictures of a rendered plotter.
+
+        Args:
+            plotter: The plotter.
+            size: Width and height [pixel].
+            screens: The actors that may hide the subject.
+            robot: The actors that nothing may hide.
+        """
+        others = [a for a in plotter.renderer.actors.values() if not any(a is part for part in robot)]
+        self._plotter, self._size = plotter, size
+        self._hidden = [actors for actors in (list(screens), others if robot else []) if actors]
         window = plotter.render_window
         window.SetAlphaBitPlanes(1)
         self._whole, self._subject = _grabber(window, alpha=False), _grabber(window, alpha=True)
@@ -637,31 +648,32 @@ class Cutaway:
     def image(self, *, whole: bool = False) -> NDArray[np.uint8]:
         """The picture from the present camera, shape (height, width, 3); all solid if `whole`."""
         image = self._grab(self._whole)
-        if whole or not self._screens:
-            return image
-        with self._subject_alone():
-            subject = self._grab(self._subject)
-        colour = subject[..., :3].astype(np.uint32)  # already multiplied by alpha, as its ground is black
-        alpha = subject[..., 3:].astype(np.uint32)
-        share = round(256 * (1 - VEIL))
-        mixed = (image * (256 - share * alpha // 255) + share * colour) >> 8
-        return np.minimum(mixed, 255).astype(np.uint8)
+        for hidden in [] if whole else self._hidden:
+            with self._without(hidden):
+                subject = self._grab(self._subject)
+            colour = subject[..., :3].astype(np.uint32)  # already multiplied by alpha, as its ground is black
+            alpha = subject[..., 3:].astype(np.uint32)
+            share = round(256 * (1 - VEIL))
+            mixed = (image * (256 - share * alpha // 255) + share * colour) >> 8
+            image = np.minimum(mixed, 255).astype(np.uint8)
+        return image
 
     @contextmanager
-    def _subject_alone(self) -> Iterator[None]:
+    def _without(self, hidden: Sequence[Any]) -> Iterator[None]:
+        """The plotter without some actors, on a transparent ground."""
         renderer = self._plotter.renderer
-        ground, shown = renderer.GetBackground(), [actor.visibility for actor in self._screens]
+        ground, shown = renderer.GetBackground(), [actor.GetVisibility() for actor in hidden]
         try:
-            for actor in self._screens:
-                actor.visibility = False
+            for actor in hidden:
+                actor.SetVisibility(False)
             renderer.SetBackground(0.0, 0.0, 0.0)
             renderer.SetBackgroundAlpha(0.0)
             yield
         finally:
             renderer.SetBackground(*ground)
             renderer.SetBackgroundAlpha(1.0)
-            for actor, visible in zip(self._screens, shown, strict=True):
-                actor.visibility = visible
+            for actor, visible in zip(hidden, shown, strict=True):
+                actor.SetVisibility(visible)
 
     def _grab(self, grabber: Any) -> NDArray[np.uint8]:
         """Render the window and copy it, shape (height, width, 3 or 4)."""

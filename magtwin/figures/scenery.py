@@ -189,7 +189,7 @@ class Scenery:
                 self.plotter.enable_anti_aliasing("msaa", multi_samples=SAMPLES)
             self._label = add_text(self.plotter, " ", max(8, round(size[1] / 60)))
             self._label.prop.background_color, self._label.prop.background_opacity = BACKGROUND, 0.7
-            self._cutaway = Cutaway(self.plotter, size, self._screens)
+            self._cutaway = Cutaway(self.plotter, size, self._screens, list(self._actors.values()))
         except BaseException:
             self.close()
             raise
