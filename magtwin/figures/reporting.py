@@ -109,7 +109,7 @@ def embedded(run: Run, scene: Source | None, height: int) -> Embedded:
     """The page of a run for a notebook; arguments as of `Run.view`."""
     from magtwin.files.kinds import scene_file
 
-    named = _named("run", run, None if scene is None else scene_file(scene), None)
+    named = named_run("run", run, None if scene is None else scene_file(scene), None)
     return Embedded(to_html(page_of_runs([named])), height)
 
 
@@ -124,10 +124,11 @@ def _each(files: Sequence[Path], scene: Path | None, progress: Progress) -> Iter
     names = [file.name for file in files]
     for k, file in enumerate(files):
         progress(k, len(files), f"reading {file.name}")
-        yield _named(file.name if names.count(file.name) == 1 else str(file), read_run(file), scene, file)
+        yield named_run(file.name if names.count(file.name) == 1 else str(file), read_run(file), scene, file)
 
 
-def _named(name: str, run: Run, scene: Path | None, file: Path | None) -> NamedRun:
+def named_run(name: str, run: Run, scene: Source | None, file: Path | None) -> NamedRun:
+    """A run with its map, planned path and scene, as far as they are at hand."""
     from magtwin.twin import scene_of
 
     note, field, stage = "", None, None

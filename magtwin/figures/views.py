@@ -1,23 +1,17 @@
-"""Views of files: show, draw or film a run or a stage; two runs compared."""
+"""Views of files: show a run or a stage; two runs compared."""
 
 import tempfile
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.figures.canvas import save
-from magtwin.figures.maps import FloorPlan, draw_map
+from magtwin.figures.maps import FloorPlan
 from magtwin.figures.page import write_page
-from magtwin.figures.reports import (
-    NamedRun,
-    draw_comparison,
-    page_of_comparison,
-    page_of_maps,
-)
+from magtwin.figures.reports import NamedRun, draw_comparison, page_of_comparison
 from magtwin.files.file import existing
-from magtwin.files.outputs import check_free
 from magtwin.io.convert import twin_to_show
 from magtwin.io.formats import read_run
 from magtwin.run.compare import Comparison, compare
@@ -52,57 +46,6 @@ def view(files: Sequence[Source], *, scene: Source | None = None) -> None:
         _view_run(paths[0], scene)
 
 
-def picture(
-    file: Source, out: Source, *, scene: Source | None = None, force: bool = False, **options: Any
-) -> None:
-    """Draw a moment of a run in its lab, as a PNG.
-
-    Args:
-        file: Run in any format.
-        out: PNG to write.
-        scene: Scene of the run. None: the one of the metadata.
-        force: Whether an existing output is replaced.
-        options: Of `magtwin.figures.scenery.picture_of_run`: camera, time_s, size.
-
-    Raises:
-        InputError: The file cannot be read or drawn, or the output exists.
-    """
-    from magtwin.figures.scenery import picture_of_run
-
-    file, out = existing(file, "run"), check_free(out, force=force)
-    run, stage = _run_and_scene(file, scene)
-    picture_of_run(run, stage, out, force=force, **options)
-
-
-def film(
-    file: Source,
-    out: Source,
-    *,
-    scene: Source | None = None,
-    pace: float | None = None,
-    force: bool = False,
-    **options: Any,
-) -> None:
-    """Film a run in its lab.
-
-    Args:
-        file: Run in any format.
-        out: MP4 or GIF to write.
-        scene: Scene of the run. None: the one of the metadata.
-        pace: Simulated seconds per second of film. None: 1, or more for a film of at most 30 s.
-        force: Whether an existing output is replaced.
-        options: Of `magtwin.figures.films.film_of_run`: camera, fps, size, advance.
-
-    Raises:
-        InputError: The file cannot be read or drawn, or the output exists.
-    """
-    from magtwin.figures.films import film_of_run
-
-    file, out = existing(file, "run"), check_free(out, force=force)
-    run, stage = _run_and_scene(file, scene)
-    film_of_run(run, stage, out, speed=pace, force=force, **options)
-
-
 def compare_files(
     a: Source,
     b: Source,
@@ -135,35 +78,6 @@ def compare_files(
     return comparison
 
 
-def plot_maps(
-    files: Sequence[Source],
-    out: Source,
-    *,
-    quantity: str = "overview",
-    headings: Sequence[float] | None = None,
-    force: bool = False,
-) -> None:
-    """Draw maps as a picture or a page, with what stands on the floor if the scene of the first is at hand.
-
-    Args:
-        files: Up to four maps, as for `magtwin.io.map_files.open_map`; several are drawn on common scales.
-        out: Picture (.png, .svg) or page (.html) to write.
-        quantity: As for `magtwin.figures.maps.draw_map`; a page has the overview.
-        headings: Headings to show [rad], or None.
-        force: Whether an existing output is replaced.
-
-    Raises:
-        InputError: A map cannot be read or drawn, or the output cannot be written.
-    """
-    from magtwin.io.map_files import open_map
-
-    fields, plan = [open_map(file) for file in files], floor_plan(files[0])
-    if Path(out).suffix.lower() == ".html":
-        write_page(page_of_maps(fields, plan), out, force=force)
-    else:
-        save(draw_map(fields, what=quantity, headings=headings, plan=plan), out, force=force)
-
-
 def floor_plan(source: Source) -> FloorPlan | None:
     """What stands on the floor of a map: by its stage, or by the stage beside it, if that reads this map."""
     from magtwin.files.file import shipped
@@ -190,7 +104,7 @@ def names_of(a: Path, b: Path) -> tuple[str, str]:
     return (a.name, b.name) if a.name != b.name else (str(a), str(b))
 
 
-def _run_and_scene(file: Path, scene: Source | None) -> tuple[Run, Path]:
+def run_and_scene(file: Path, scene: Source | None) -> tuple[Run, Path]:
     """A run and its scene; warns if the scene has changed since."""
     from magtwin.twin import scene_of
 
