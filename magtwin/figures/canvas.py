@@ -196,36 +196,28 @@ def draw_line(ax: Axes, t: Array, values: Array, **look: Any) -> None:
 def coloured_line(
     ax: Axes, points: Array, values: Array, limits: tuple[float, float], colours: str, width: float
 ) -> LineCollection:
-    """Draw a line coloured by the values at its points; segments beside an unknown value are left out.
+    """Draw a line through finite points (N, 2) coloured by the values (N,) at them, of a width in points.
 
-    Args:
-        ax: Where to draw.
-        points: Shape (N, 2), finite.
-        values: Shape (N,).
-        limits: Values at the ends of the colour scale.
-        colours: Name of the colour scale.
-        width: Width of the line [points].
+    Segments beside an unknown value are left out. `limits` are the values at the ends of the colour scale.
     """
     rows = newest(evenly(len(points), SEGMENTS + 1), np.isfinite(values))
     points, values = points[rows], values[rows]
-    line = LineCollection(
-        list(np.stack([points[:-1], points[1:]], axis=1)),
-        array=np.ma.masked_invalid((values[:-1] + values[1:]) / 2),
-        cmap=colours,
-        clim=limits,
-        lw=width,
-        capstyle="round",
-        zorder=3,
-        rasterized=True,
-    )
+    middle = np.ma.masked_invalid((values[:-1] + values[1:]) / 2)
+    look: dict[str, Any] = {"lw": width, "capstyle": "round", "zorder": 3, "rasterized": True}
+    segments = list(np.stack([points[:-1], points[1:]], axis=1))
+    line = LineCollection(segments, array=middle, cmap=colours, clim=limits, **look)
     ax.add_collection(line)
     return line
 
 
+def stretches(on: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """First index and the one after the last of each stretch in which a flag is set, shape (K, 2)."""
+    return np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int))).reshape(-1, 2)
+
+
 def shade(ax: Axes, t: Array, on: NDArray[np.bool_], *, colour: str = LIDAR, name: str = "_") -> None:
     """Shade the spans of time in which a flag is set, the first of them with a name for the legend."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int)))
-    for k, (first, last) in enumerate(edges.reshape(-1, 2)):
+    for k, (first, last) in enumerate(stretches(on)):
         end = t[min(last, len(t) - 1)]
         ax.axvspan(t[first], end, color=colour, lw=0, zorder=-1, label="_" if k else name)
 
@@ -241,13 +233,7 @@ def zero_line(ax: Axes) -> None:
 
 
 def thinned(t: Array, values: Array, points: int = POINTS) -> tuple[Array, Array]:
-    """A line of fewer points that looks the same: the least and the greatest value of each stretch.
-
-    Args:
-        t: Ascending positions of the values, shape (N,).
-        values: Shape (N,); values that are not finite make gaps.
-        points: Approximate number of points to keep.
-    """
+    """A line (N,) of about as many points that looks the same: the least and greatest of each stretch."""
     size = max(1, 2 * len(t) // points)
     if size == 1:
         return t, values

@@ -56,13 +56,7 @@ def page_of_evaluation(
     budgets: Sequence[Budget] = (),
     both: tuple[Traversals, tuple[str, str]] | None = None,
 ) -> Page:
-    """The report of an evaluation.
-
-    Args:
-        evaluation: Result of `magtwin.learn.evaluation.evaluate.evaluate`.
-        budgets: Error budgets of its models.
-        both: One path driven twice, and the names of the two runs.
-    """
+    """The report of an evaluation, with error budgets and one path driven twice, by two named runs."""
     every = evaluation.every
     against = "the exact field" if evaluation.truth else "the reading"
     verdicts = [f"{name}: {line}" for name, line in evaluation.verdicts().items()]
@@ -78,20 +72,14 @@ def page_of_evaluation(
     lost = tuple(evaluation.left_out.items())
     note = "All models are evaluated on the same readings." if lost else "None."
     left_out = Table("Readings left out", ("reason", "readings"), lost, note, folded=True)
-    charts = [_path_errors(evaluation), *_time_series(evaluation)]
-    pictures = [
-        *(chart.picture() for chart in charts),
-        *_floor_plan(evaluation),
-        *_rank_correlations(evaluation),
-    ]
+    pictures = [chart.picture() for chart in (_path_errors(evaluation), *_time_series(evaluation))]
+    pictures += [*_floor_plan(evaluation), *_rank_correlations(evaluation)]
     sections = (
         Section("Errors", "", tuple(pictures)),
         Section("Table 1", _lead_of_table(evaluation), (), (_table(evaluation),)),
         *([_budgets(budgets)] if budgets else []),
         *([section_of_traversals(*both)] if both else []),
-        Section(
-            "Details", "", (), (_intervals(evaluation), _models(evaluation), _maps(evaluation), left_out)
-        ),
+        Section("Details", "", (), (*(f(evaluation) for f in (_intervals, _models, _maps)), left_out)),
     )
     data = evaluation.summary()
     data |= {"budget": {"models": [budget.summary() for budget in budgets]}} if budgets else {}
@@ -285,10 +273,8 @@ def _time_series(evaluation: Evaluation) -> list[Chart]:
     for m in _trained(evaluation):
         off = np.abs(one.total_nt[m, seen] - one.measured_nt[seen])[kept]
         mae = np.nanmean(off) if np.isfinite(off).any() else np.nan
-        title = (
-            f"Figure 5: errors of {short_name(evaluation.names[m], 40)} on {where}: mean size {mae:.0f} nT"
-        )
-        charts.append(Chart(title, errors(m), file=f"figure_5_{m}"))
+        title = f"Figure 5: errors of {short_name(evaluation.names[m], 40)} on {where}"
+        charts.append(Chart(f"{title}: mean size {mae:.0f} nT", errors(m), file=f"figure_5_{m}"))
     return charts
 
 

@@ -3,6 +3,8 @@
 import math
 import os
 import textwrap
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +44,7 @@ from magtwin.io.rerun.localization import write_localization
 from magtwin.tasks.localizing import Localization, truth_name
 
 DEAD_LOOK: dict[str, Any] = {"color": DATA, "ls": (0, (4, 2))}
-BOUND_LOOK: dict[str, Any] = {"color": BOUND, "ls": (0, (1.5, 1.2)), "lw": 1.7}
+BOUND_LOOK: dict[str, Any] = {"color": BOUND, "ls": (0, (1.5, 1.2))}
 BAND_LOOK: dict[str, Any] = {"color": MODEL, "alpha": 0.22, "lw": 0}
 
 ELLIPSE_S = 5.0
@@ -80,8 +82,7 @@ def draw_localization(result: Localization) -> Figure:
     """
     if not len(result.track.t):
         raise InputError("the run has no readings to draw")
-    belief = result.problem.belief
-    field = belief if isinstance(belief, AnomalyMap) else None
+    field = _map_of(result)
     x0, x1, y0, y1 = _extent(result, field)
     tall = float(np.clip((WIDTH_IN - 2.2) * (y1 - y0) / (x1 - x0), 2.5, 7.0))
     figure = new_figure(WIDTH_IN, tall + 5.7)
@@ -101,8 +102,7 @@ def draw_localization(result: Localization) -> Figure:
 
 def page_of_localization(result: Localization) -> Page:
     """A localization as a page: the verdict, its figures, the path and the errors."""
-    belief = result.problem.belief
-    field = belief if isinstance(belief, AnomalyMap) else None
+    field = _map_of(result)
     x0, x1, y0, y1 = _extent(result, field)
     tall = float(np.clip((canvas.WIDTH_IN - 0.8) * (y1 - y0) / (x1 - x0), 1.5, 6.0))
 
@@ -110,14 +110,11 @@ def page_of_localization(result: Localization) -> Page:
         _draw_floor(ax, result, field)
         ax.set(xlim=(x0, x1), ylim=(y0, y1))
 
-    def position(ax: Axes) -> None:
-        _draw_position(ax, result)
+    def timed(draw: Callable[[Axes, Localization], None], ax: Axes) -> None:
+        draw(ax, result)
         label(ax, "time [s]")
 
-    def heading(ax: Axes) -> None:
-        _draw_heading(ax, result)
-        label(ax, "time [s]")
-
+    position, heading = partial(timed, _draw_position), partial(timed, _draw_heading)
     charts = (
         Chart("The estimated path over the map", floor, tall + 2.0, "path"),
         Chart("Error of the position, and the bound of any method", position, 3.4, "position"),
@@ -125,6 +122,11 @@ def page_of_localization(result: Localization) -> Page:
     )
     lead = _title(result).partition("\n")[0]
     return page_of_report(result.report(), "Localization", f"{lead}.", charts)
+
+
+def _map_of(result: Localization) -> AnomalyMap | None:
+    belief = result.problem.belief
+    return belief if isinstance(belief, AnomalyMap) else None
 
 
 def _extent(result: Localization, field: AnomalyMap | None) -> tuple[float, float, float, float]:
@@ -163,9 +165,8 @@ def _draw_floor(ax: Axes, result: Localization, field: AnomalyMap | None) -> Non
         entries.append(Line2D([], [], color=MODEL, lw=1.0, marker="o", mfc="none", ms=9, ls=""))
         entries[-1].set_label("its 2-sigma ellipse")
     start = result.truth if result.truth is not None else pose
-    entries.extend(
-        ax.plot(*start[0, :2], marker="s", ms=7, mfc=PAPER, mec=INK, ls="", zorder=7, label="start")
-    )
+    square: dict[str, Any] = {"marker": "s", "ms": 7, "mfc": PAPER, "mec": INK, "ls": "", "zorder": 7}
+    entries.extend(ax.plot(*start[0, :2], label="start", **square))
     ax.set_aspect("equal")
     label(ax, "x [m]", "y [m]")
     legend_above(ax, 6, handles=entries)
@@ -207,9 +208,7 @@ def _draw_position(ax: Axes, result: Localization) -> None:
     if error is not None:
         draw_line(ax, t, error, color=MODEL, label="estimate")
     if result.bounds is not None:
-        draw_line(
-            ax, t, result.bounds.correlated, color=BOUND, ls=(0, (1.5, 1.2)), lw=1.8, label="bound, 1 sigma"
-        )
+        draw_line(ax, t, result.bounds.correlated, lw=1.8, label="bound, 1 sigma", **BOUND_LOOK)
     shade(ax, t, track.lost, colour=LOST, name="flagged lost")
     most = max(most, float(np.nanmax(dead)) if dead is not None else 0.0)
     if log:
@@ -236,9 +235,7 @@ def _draw_heading(ax: Axes, result: Localization) -> None:
         most = max(most, float(np.nanquantile(np.abs(error), 0.98)))
     if result.bounds is not None:
         for sign in (-1, 1):
-            draw_line(
-                ax, t, sign * np.degrees(result.bounds.heading), color=BOUND, ls=(0, (1.5, 1.2)), lw=1.6
-            )
+            draw_line(ax, t, sign * np.degrees(result.bounds.heading), lw=1.6, **BOUND_LOOK)
     shade(ax, t, track.lost, colour=LOST)
     ax.set(xlim=(t[0], t[-1]), ylim=(-1.25 * most, 1.25 * most))
     label(ax, y="heading\nerror [°]")
@@ -277,14 +274,13 @@ def save_localization(result: Localization, out: str | os.PathLike[str], *, forc
     Raises:
         InputError: The folder exists, or cannot be written.
     """
-    belief = result.problem.belief
     with output(out, force=force) as folder:
         folder.mkdir()
         result.run.save(folder / "run.parquet")
         write_localization(
             result.run,
             folder / "localize.rrd",
-            anomaly_map=belief if isinstance(belief, AnomalyMap) else None,
+            anomaly_map=_map_of(result),
             truth=result.truth,
             dead_reckoning=None if result.dead_reckoning is None else result.dead_reckoning.pose,
             bound_m=None if result.bounds is None else result.bounds.correlated,

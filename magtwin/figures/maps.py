@@ -147,9 +147,8 @@ def map_charts(fields: Sequence[AnomalyMap], plan: "FloorPlan | None" = None) ->
             x0, x1, y0, y1 = panel.field.extent if plan is None else plan.extent(panel.field.extent)
             tall = float(np.clip((WIDTH_IN - 0.8) * (y1 - y0) / (x1 - x0), 1.4, 6.0))
             draw = partial(_draw_alone, panel=panel, scale=scale, plan=plan)
-            charts.append(
-                Chart(panel.title, draw, tall + 1.1, f"{quantity}_{panel.field.name}".replace(" ", "_"))
-            )
+            file = f"{quantity}_{panel.field.name}".replace(" ", "_")
+            charts.append(Chart(panel.title, draw, tall + 1.1, file))
     return charts
 
 
@@ -198,15 +197,9 @@ def draw_difference(difference: MapDifference) -> Figure:
 def draw_cells(
     ax: Axes, x_m: Array, y_m: Array, layer: Array, colours: str | Colormap, **look: Any
 ) -> ScalarMappable:
-    """Draw one layer of a map, one cell per node, over hatched grey that shows where it is unknown.
+    """Draw a layer (Y, X) of a map, one cell per node, over hatched grey that shows where it is nan.
 
-    Args:
-        ax: Where to draw.
-        x_m: Nodes along x [m], shape (X,).
-        y_m: Nodes along y [m], shape (Y,).
-        layer: Values, nan where unknown, shape (Y, X).
-        colours: The colour scale, or its name.
-        look: Further options of `pcolormesh`, such as `vmin` and `vmax`.
+    The nodes x_m (X,) and y_m (Y,) are in metres; `look` has further options of `pcolormesh`.
     """
     if np.isnan(layer).any():
         ax.set_facecolor(MASKED)
@@ -433,9 +426,8 @@ def _overviews(fields: Sequence[AnomalyMap]) -> list[_Panel | None]:
 
 def _overview(name: str, field: AnomalyMap, *, several: bool) -> _Panel | None:
     """A quantity of the overview; None if the map does not know it."""
-    if (name == "heading effect" and len(field.headings_rad) < 2) or (
-        name == "sd" and field.variance_nt2 is None
-    ):
+    unknown = {"heading effect": len(field.headings_rad) < 2, "sd": field.variance_nt2 is None}
+    if unknown.get(name):
         return None
     layer = _slope(mean_field_nt(field), field) if name == "gradient" else QUANTITIES[name].layers(field)[0]
     title = f"{field.name}, " * several + OVERVIEW[name]
@@ -510,12 +502,7 @@ class _Scale:
 
 def _between_headings(field: AnomalyMap, layers: Array, headings: Array) -> Array:
     """Layers at other headings, interpolated as a map lookup does."""
-    parts: dict[str, Any] = {
-        "variance_nt2": None,
-        "between_nt2": None,
-        "harmonic": None,
-        "recorded_yaw": None,
-    }
+    parts: dict[str, Any] = dict.fromkeys(("variance_nt2", "between_nt2", "harmonic", "recorded_yaw"))
     x, y = np.meshgrid(field.x_m, field.y_m)
     values = replace(field, values_nt=layers, valid=np.isfinite(layers), **parts)
     return values.lookup(np.stack([x, y], axis=-1)[None], headings[:, None, None])
@@ -528,14 +515,9 @@ def _draw_regions(ax: Axes, difference: MapDifference) -> None:
         x0, x1, y0, y1 = region.extent_m
         corner = (x0 - dx / 2, y0 - dy / 2)
         ax.add_patch(Rectangle(corner, x1 - x0 + dx, y1 - y0 + dy, fill=False, ec=INK, lw=1.2))
-        ax.annotate(
-            str(number),
-            (x0 - dx / 2, y1 + dy / 2),
-            xytext=(2, -2),
-            textcoords="offset points",
-            va="top",
-            bbox={"boxstyle": "round,pad=0.15", "fc": PAPER, "ec": "none", "alpha": 0.8},
-        )
+        box = {"boxstyle": "round,pad=0.15", "fc": PAPER, "ec": "none", "alpha": 0.8}
+        upper = (x0 - dx / 2, y1 + dy / 2)
+        ax.annotate(str(number), upper, (2, -2), textcoords="offset points", va="top", bbox=box)
 
 
 def _summary(field: AnomalyMap, width: int) -> str:

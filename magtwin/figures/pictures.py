@@ -4,7 +4,7 @@ import ctypes
 import itertools
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -25,6 +25,7 @@ from magtwin.spec.base import Vec3
 from magtwin.urdf.meshes.texture import opened_image
 from magtwin.usd.geometry import (
     ColourScale,
+    Link,
     Shape,
     linear_from_srgb,
     read_colour_scale,
@@ -189,6 +190,16 @@ def show_stage(path: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 1
         plotter.close()
 
 
+def in_world(shapes: Sequence[Shape], links: Mapping[str, Link]) -> list[Array]:
+    """Vertices of each shape in the axes of its stage [m], of shape (N, 3); those of links at rest."""
+    return [
+        rotate(links[s.link].q_world_link_xyzw, s.vertices) + links[s.link].p_world_link
+        if s.link
+        else s.vertices.astype(float)
+        for s in shapes
+    ]
+
+
 def is_subject(shape: Shape, scale: ColourScale | None) -> bool:
     """Whether a shape must not be hidden: a heat-map, or a part of a robot."""
     return bool(shape.link) or (scale is not None and shape.prim == scale.prim)
@@ -281,10 +292,8 @@ def add_shape(plotter: Any, shape: Shape, vertices: NDArray, *, baked: bool = Fa
     """Draw a shape on its own; returns its actor."""
     if shape.texture is not None:
         return add_textured(plotter, shape, vertices)
-    mesh, flat = mesh_of(shape, vertices), shape.vertex_colours is not None
-    if baked and not flat:
-        bake(mesh)
-    return plotter.add_mesh(mesh, opacity=shape.colour[3], **style_of(flat or baked))
+    flat = baked or shape.vertex_colours is not None
+    return plotter.add_mesh(mesh_of(shape, vertices, baked=baked), opacity=shape.colour[3], **style_of(flat))
 
 
 def add_still(
@@ -325,9 +334,7 @@ def add_still(
             actor = add_shape(plotter, shape, vertices)
             screens += [actor] if hiding else []
             continue
-        mesh = mesh_of(shape, vertices)
-        if baked and not flat:
-            bake(mesh)
+        mesh = mesh_of(shape, vertices, baked=baked)
         bodies.setdefault((hiding, flat or baked, shape.colour[3]), []).append(mesh)
     for (hiding, flat, opacity), meshes in bodies.items():
         actor = plotter.add_mesh(joined(meshes), opacity=opacity, **style_of(flat))
@@ -351,13 +358,7 @@ def _draw(
     if not shapes:
         raise InputError(f"{path}: shows nothing; a picture needs at least one visible shape")
     links = read_links(stage)
-    worlds = [
-        rotate(links[s.link].q_world_link_xyzw, s.vertices) + links[s.link].p_world_link
-        if s.link
-        else s.vertices.astype(float)
-        for s in shapes
-    ]
-    worlds = [upright(stage, vertices) for vertices in worlds]
+    worlds = [upright(stage, vertices) for vertices in in_world(shapes, links)]
     everything, scale = np.vstack(worlds), read_colour_scale(stage)
     subject = [is_subject(shape, scale) for shape in shapes]
     in_lab = scale is not None and any(s.prim == scale.prim for s in shapes)
@@ -483,8 +484,8 @@ def style_of(flat: bool) -> dict[str, Any]:
     return {"scalars": "rgb", "rgb": True, "smooth_shading": True, **shading}
 
 
-def mesh_of(shape: Shape, vertices: NDArray) -> Any:
-    """A shape as a mesh with colours at its points; with normals for shading unless it is a map."""
+def mesh_of(shape: Shape, vertices: NDArray, *, baked: bool = False) -> Any:
+    """A shape as a mesh with colours at its points; unless it is a map, with normals or its light."""
     import pyvista
 
     faces: NDArray[np.integer] = shape.faces
@@ -499,6 +500,8 @@ def mesh_of(shape: Shape, vertices: NDArray) -> Any:
     )
     colour = (255 * np.array(srgb_from_linear(shape.colour[:3]))).round().astype(np.uint8)
     mesh["rgb"] = np.tile(colour, (mesh.n_points, 1))
+    if baked:
+        bake(mesh)
     return mesh
 
 

@@ -240,16 +240,7 @@ def draw_path(
     planned: ArrayLike | None,
     plan: FloorPlan | None = None,
 ) -> None:
-    """Draw the path of a run over the map, coloured by its `Trail`.
-
-    Args:
-        ax: Where to draw.
-        run: The run.
-        place: Its column of positions, of which one at least is known.
-        field: The map below it, or None.
-        planned: The planned path in world [m], shape (M, 2), or None.
-        plan: Walls, furniture and doors, or None.
-    """
+    """Draw the path of a run, its column `place`, over the map, coloured by its `Trail`."""
     known = np.isfinite(run[place][:, :2]).all(axis=1)
     p_xy, limits = run[place][known, :2], None
     if field is not None:
@@ -299,15 +290,7 @@ def path_picture(
     plan: FloorPlan | None = None,
     kind: str = "png",
 ) -> Picture | None:
-    """The path of a run over its map, or over a bare floor; None if its places or readings are unknown.
-
-    Args:
-        run: The run.
-        field: The map below the path, or None.
-        planned: The planned path in world [m], shape (M, 2), or None.
-        plan: Walls, furniture and doors, or None.
-        kind: "png" or "svg".
-    """
+    """The path of a run over its map, or over a bare floor; None if its places or readings are unknown."""
     position, column = position_name(run), field_name(run)
     if position is None or column is None or np.isfinite(run[position][:, :2]).all(axis=1).sum() < 2:
         return None

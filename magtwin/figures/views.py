@@ -11,36 +11,33 @@ from magtwin.figures.canvas import save
 from magtwin.figures.maps import FloorPlan
 from magtwin.figures.page import write_page
 from magtwin.figures.reports import NamedRun, draw_comparison, page_of_comparison
-from magtwin.files.file import existing
+from magtwin.files.file import existing, shipped
+from magtwin.files.kinds import USD_SUFFIXES, shipped_or
 from magtwin.io.convert import twin_to_show
 from magtwin.io.formats import read_run
 from magtwin.run.compare import Comparison, compare
 from magtwin.run.run import Run
+from magtwin.twin import scene_of
 from magtwin.usd.layers import stage_sha256
-
-STAGES = (".usd", ".usda", ".usdc", ".usdz")
+from magtwin.usd.scene import open_scene
 
 Source = str | Path
 
 
 def view(files: Sequence[Source], *, scene: Source | None = None) -> None:
-    """Show runs in the Rerun viewer, or a stage in a window, until it is closed.
+    """Show runs on one timeline in the Rerun viewer, or a stage in a window, until it is closed.
 
-    Args:
-        files: Runs in any format, on one timeline; or one stage.
-        scene: Stage to show runs in. None: the one of the metadata.
+    `scene` is the stage to show runs in, by default the one of their metadata.
 
     Raises:
         InputError: A file cannot be read, or there is no viewer.
     """
-    from magtwin.files.kinds import shipped_or
-
     paths = [shipped_or(file) for file in files]
     if not paths:
         raise InputError("name a run or a stage to view")
     if len(paths) > 1:
         _view_together(paths, scene)
-    elif paths[0].suffix.lower() in STAGES and not paths[0].is_dir():
+    elif paths[0].suffix.lower() in USD_SUFFIXES and not paths[0].is_dir():
         _view_stage(paths[0])
     else:
         _view_run(paths[0], scene)
@@ -54,14 +51,7 @@ def compare_files(
     out: Source | None = None,
     force: bool = False,
 ) -> Comparison:
-    """Compare two runs, and draw the comparison.
-
-    Args:
-        a: First run, in any format.
-        b: Second run.
-        align: As for `magtwin.run.compare.compare`.
-        out: Picture (.png, .svg) or page (.html) to write.
-        force: Whether an existing output is replaced.
+    """Compare two runs in any format, and draw the comparison as a picture (.png, .svg) or a page (.html).
 
     Raises:
         InputError: A run cannot be read, they do not overlap, or the output cannot be written.
@@ -80,9 +70,7 @@ def compare_files(
 
 def floor_plan(source: Source) -> FloorPlan | None:
     """What stands on the floor of a map: by its stage, or by the stage beside it, if that reads this map."""
-    from magtwin.files.file import shipped
     from magtwin.io.map_files import map_file
-    from magtwin.usd.scene import open_scene
 
     path = map_file(source)
     folders = [path.parent, path.parent.parent, shipped("scenes") / path.resolve().parent.name]
@@ -106,8 +94,6 @@ def names_of(a: Path, b: Path) -> tuple[str, str]:
 
 def run_and_scene(file: Path, scene: Source | None) -> tuple[Run, Path]:
     """A run and its scene; warns if the scene has changed since."""
-    from magtwin.twin import scene_of
-
     run = read_run(file)
     stage = scene_of(run, scene, near=file)
     if "scene_sha256" in run.metadata and run.metadata["scene_sha256"] != stage_sha256(stage):
