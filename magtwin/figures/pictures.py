@@ -4,7 +4,7 @@ import ctypes
 import itertools
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -25,7 +25,6 @@ from magtwin.spec.base import Vec3
 from magtwin.urdf.meshes.texture import opened_image
 from magtwin.usd.geometry import (
     ColourScale,
-    Link,
     Shape,
     linear_from_srgb,
     read_colour_scale,
@@ -190,16 +189,6 @@ def show_stage(path: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 1
         plotter.close()
 
 
-def in_world(shapes: Sequence[Shape], links: Mapping[str, Link]) -> list[Array]:
-    """Vertices of each shape in the axes of its stage [m], of shape (N, 3); those of links at rest."""
-    return [
-        rotate(links[s.link].q_world_link_xyzw, s.vertices) + links[s.link].p_world_link
-        if s.link
-        else s.vertices.astype(float)
-        for s in shapes
-    ]
-
-
 def is_subject(shape: Shape, scale: ColourScale | None) -> bool:
     """Whether a shape must not be hidden: a heat-map, or a part of a robot."""
     return bool(shape.link) or (scale is not None and shape.prim == scale.prim)
@@ -358,7 +347,13 @@ def _draw(
     if not shapes:
         raise InputError(f"{path}: shows nothing; a picture needs at least one visible shape")
     links = read_links(stage)
-    worlds = [upright(stage, vertices) for vertices in in_world(shapes, links)]
+    worlds = [
+        rotate(links[s.link].q_world_link_xyzw, s.vertices) + links[s.link].p_world_link
+        if s.link
+        else s.vertices.astype(float)
+        for s in shapes
+    ]
+    worlds = [upright(stage, vertices) for vertices in worlds]
     everything, scale = np.vstack(worlds), read_colour_scale(stage)
     subject = [is_subject(shape, scale) for shape in shapes]
     in_lab = scale is not None and any(s.prim == scale.prim for s in shapes)

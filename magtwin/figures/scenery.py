@@ -23,7 +23,6 @@ from magtwin.figures.pictures import (
     aim,
     check_png,
     check_size,
-    in_world,
     inside,
     is_subject,
     joined,
@@ -271,7 +270,7 @@ class Scenery:
         scale: ColourScale | None,
     ) -> None:
         """Build the lab, one body per look, and each link of the robot."""
-        standing = in_world(still, links)
+        standing = [placed(s.vertices, links[s.link]) if s.link else s.vertices.astype(float) for s in still]
         self._subjects = [v for s, v in zip(still, standing, strict=True) if is_subject(s, scale)]
         self._screens, self._walls, self._points = add_still(
             self.plotter, still, standing, scale, baked=not fine
