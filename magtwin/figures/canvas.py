@@ -17,13 +17,12 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.figures.style import FAINT, LIDAR, PAPER, styled
+from magtwin.figures.style import FAINT, LIDAR, styled
 from magtwin.files.outputs import output
 from magtwin.report.summary import printable_lines
 from magtwin.run.thinning import newest
@@ -169,11 +168,6 @@ def legend_above(ax: Axes, columns: int = 4, **options: Any) -> None:
         ax.legend(ncols=columns, loc="lower left", bbox_to_anchor=(0, 1), **options)
 
 
-def legend_below(figure: Figure, *entries: Any, columns: int = 2) -> None:
-    """A legend below the whole figure."""
-    figure.legend(*entries, loc="outside lower center", ncols=columns)
-
-
 def colour_bar(figure: Any, drawn: ScalarMappable, axes: Any, title: str, **options: Any) -> None:
     """A colour bar with a title, to the right or, with `below`, under the axes."""
     flat = {"orientation": "horizontal", "aspect": 36, "ticks": MaxNLocator(4)}
@@ -222,11 +216,6 @@ def shade(ax: Axes, t: Array, on: NDArray[np.bool_], *, colour: str = LIDAR, nam
         ax.axvspan(t[first], end, color=colour, lw=0, zorder=-1, label="_" if k else name)
 
 
-def halo(width: float = 1.6) -> dict[str, Any]:
-    """The look of a line over a map: a rim in the colour of the paper."""
-    return {"path_effects": [withStroke(linewidth=2 * width, foreground=PAPER)]}
-
-
 def zero_line(ax: Axes) -> None:
     """A thin line at zero."""
     ax.axhline(0, color=FAINT, lw=0.7, zorder=0)
@@ -252,9 +241,3 @@ def short_name(name: str, most: int = LONGEST_NAME) -> str:
     """A name of at most `most` characters; a long one loses its middle."""
     half = (most - 1) // 2
     return name if len(name) <= most else f"{name[:half]}…{name[-half:]}"
-
-
-def short_pair(names: tuple[str, str]) -> tuple[str, str]:
-    """Short names of two runs, which always differ."""
-    a, b = (short_name(name) for name in names)
-    return (a, b) if a != b else (f"A: {a}", f"B: {b}")

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter
-from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
@@ -26,7 +26,6 @@ from magtwin.figures.canvas import (
     Chart,
     draw_line,
     evenly,
-    halo,
     label,
     legend_above,
     new_figure,
@@ -45,6 +44,7 @@ from magtwin.tasks.localizing import Localization, truth_name
 
 DEAD_LOOK: dict[str, Any] = {"color": DATA, "ls": (0, (4, 2))}
 BOUND_LOOK: dict[str, Any] = {"color": BOUND, "ls": (0, (1.5, 1.2))}
+RIM = [withStroke(linewidth=3.2, foreground=PAPER)]  # of a line over a map
 BAND_LOOK: dict[str, Any] = {"color": MODEL, "alpha": 0.22, "lw": 0}
 
 ELLIPSE_S = 5.0
@@ -149,15 +149,18 @@ def _draw_floor(ax: Axes, result: Localization, field: AnomalyMap | None) -> Non
     entries: list[Line2D | Patch] = []
 
     def path(p: Array, name: str, **look: Any) -> None:
-        entries.extend(ax.plot(*p[evenly(len(p), 3000), :2].T, label=name, **halo(), **look))
+        entries.extend(ax.plot(*p[evenly(len(p), 3000), :2].T, label=name, path_effects=RIM, **look))
 
     if result.dead_reckoning is not None:
         path(result.dead_reckoning.pose, _dead_name(result), zorder=3, **DEAD_LOOK)
     if result.truth is not None:
-        path(result.truth, _true_name(result), color=INK, lw=2.0, zorder=4)
+        name = "true path" if truth_name(result.run) == "true pose" else "motion capture"
+        path(result.truth, name, color=INK, lw=2.0, zorder=4)
     trusted = np.where(result.track.lost[:, None], np.nan, pose)
     path(trusted, "estimate", color=MODEL, lw=1.6, zorder=5)
-    rows = _ellipse_rows(t, result.track.lost)
+    ticks = np.arange(t[0], t[-1] + 1e-9, max(ELLIPSE_S, (t[-1] - t[0]) / MOST_ELLIPSES))
+    rows = np.unique(np.searchsorted(t, ticks))
+    rows = rows[~result.track.lost[rows]]
     rows = rows[np.isfinite(result.track.covariance[rows]).all(axis=(1, 2))]
     if len(rows):
         lines = [ellipse(pose[k, :2], result.track.covariance[k, :2, :2]) for k in rows]
@@ -178,14 +181,6 @@ def ellipse(p_xy: Array, covariance: Array, sigmas: float = 2.0) -> Array:
     angle = np.linspace(0, 2 * np.pi, 49)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     return np.asarray(p_xy + sigmas * (circle * np.sqrt(np.maximum(values, 0.0))) @ axes.T)
-
-
-def _ellipse_rows(t: Array, lost: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Rows at which ellipses are drawn: at even times, without those at which the pose is lost."""
-    every = max(ELLIPSE_S, (t[-1] - t[0]) / MOST_ELLIPSES)
-    ticks = np.arange(t[0], t[-1] + 1e-9, every)
-    rows = np.unique(np.searchsorted(t, ticks))
-    return rows[~lost[rows]]
 
 
 def _draw_position(ax: Axes, result: Localization) -> None:
@@ -239,10 +234,6 @@ def _draw_heading(ax: Axes, result: Localization) -> None:
     shade(ax, t, track.lost, colour=LOST)
     ax.set(xlim=(t[0], t[-1]), ylim=(-1.25 * most, 1.25 * most))
     label(ax, y="heading\nerror [°]")
-
-
-def _true_name(result: Localization) -> str:
-    return "true path" if truth_name(result.run) == "true pose" else "motion capture"
 
 
 def _dead_name(result: Localization) -> str:

@@ -395,7 +395,9 @@ class _Panel:
         self, ax: Axes, scale: "_Scale", plan: "FloorPlan | None"
     ) -> tuple[ScalarMappable, dict[str, Patch]]:
         """Draw the layer and what stands there; returns what a colour bar needs, and a legend's entries."""
-        x, y, layer = _thinned(self)
+        every = -(-max(self.layer.shape) // MOST_NODES_A_SIDE)
+        j, i = (np.unique(np.append(np.arange(0, n, every), n - 1)) for n in self.layer.shape)
+        x, y, layer = self.field.x_m[i], self.field.y_m[j], self.layer[j][:, i]
         keys = {} if plan is None else plan.keys()
         if self.quantity == "mask":
             drawn = draw_cells(ax, x, y, layer, ListedColormap([PALETTE["teal"][0]]), alpha=0.5)
@@ -453,13 +455,6 @@ def _by_heading(
         title = f"{field.name}, " * several + f"heading {np.degrees(heading):.4g}°{masked}"
         panels.append(_Panel(title, what, field, layer))
     return panels
-
-
-def _thinned(panel: _Panel) -> tuple[Array, Array, Array]:
-    """Nodes along x and y [m], and values, of as many nodes as can be told apart."""
-    every = -(-max(panel.layer.shape) // MOST_NODES_A_SIDE)
-    j, i = (np.unique(np.append(np.arange(0, n, every), n - 1)) for n in panel.layer.shape)
-    return panel.field.x_m[i], panel.field.y_m[j], panel.layer[j][:, i]
 
 
 @dataclass(frozen=True)

@@ -587,11 +587,6 @@ def aim(
     plotter.renderer.ResetCameraClippingRange()
 
 
-def add_text(plotter: Any, text: str, letters: int) -> Any:
-    """A line of text at the upper left."""
-    return plotter.add_text(text, position=(0.02, 0.93), viewport=True, font_size=letters, color=INK)
-
-
 def add_bar(plotter: Any, colour_map: str, limits: tuple[float, float], title: str, half: str = "") -> None:
     """A colour bar at the right, of the whole height or the "upper" or "lower" half."""
     import pyvista

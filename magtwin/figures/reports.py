@@ -23,7 +23,7 @@ from magtwin.figures.canvas import (
     label,
     legend_above,
     new_figure,
-    short_pair,
+    short_name,
     small,
     stretches,
 )
@@ -395,7 +395,8 @@ def section_of_traversals(both: Traversals, names: tuple[str, str]) -> Section:
 def _charts(a: NamedRun, b: NamedRun, comparison: Comparison) -> list[Chart]:
     """The field as recorded and aligned, the distance, and both paths, as far as they are known."""
     column, position = field_name(a.run, b.run), position_name(a.run, b.run)
-    names = short_pair((a.name, b.name))
+    names = tuple(short_name(one.name) for one in (a, b))
+    names = names if names[0] != names[1] else (f"A: {names[0]}", f"B: {names[1]}")
     along = "distance driven [m]" if comparison.align == "path" else "time [s]"
     looks: Any = ({"color": DATA, "lw": 2.2, "alpha": 0.6}, {"color": MODEL, "lw": 1.1})
 

@@ -88,7 +88,7 @@ def draw_run(
     figure = new_figure(14.0 if both else 8.0, 8.0 if len(panels) > 3 or not both else 6.0)
     sides = figure.subfigures(1, 1 + both, squeeze=False, width_ratios=(1.1, 1)[: 1 + both])[0]
     if place is not None:
-        if not np.isfinite(run[place][:, :2]).all(axis=1).any():
+        if not len(_places(run, place)):
             raise InputError(f"no position is known in {place!r} of the run")
         draw_path(sides[0].subplots(), run, place, field, planned, plan)
     sides[0].suptitle(_title(run, place), x=0.02, ha="left")
@@ -278,6 +278,11 @@ def position_name(*runs: Run) -> str | None:
     return next((name for name in POSITIONS if all(_has(run, name) for run in runs)), None)
 
 
+def _places(run: Run, column: str) -> Array:
+    """The known positions of a column along x and y [m], shape (N, 2)."""
+    return run[column][np.isfinite(run[column][:, :2]).all(axis=1), :2]
+
+
 def _has(run: Run, *names: str) -> bool:
     return all(name in run and np.isfinite(run[name]).any() for name in names)
 
@@ -287,21 +292,19 @@ def path_picture(
     run: Run,
     field: AnomalyMap | None,
     planned: ArrayLike | None,
-    plan: FloorPlan | None = None,
-    kind: str = "png",
 ) -> Picture | None:
     """The path of a run over its map, or over a bare floor; None if its places or readings are unknown."""
     position, column = position_name(run), field_name(run)
-    if position is None or column is None or np.isfinite(run[position][:, :2]).all(axis=1).sum() < 2:
+    if position is None or column is None or len(_places(run, position)) < 2:
         return None
-    p_xy = run[position][np.isfinite(run[position][:, :2]).all(axis=1), :2]
+    p_xy = _places(run, position)
     wide, tall = np.ptp(p_xy, axis=0) if field is None else np.ptp(np.reshape(field.extent, (2, 2)), axis=1)
     height = float(np.clip((WIDTH_IN - 0.8) * tall / max(wide, 1e-9), 1.5, 6.0))
     figure = new_figure(WIDTH_IN, height + (1.9 if field is not None else 1.2))
-    draw_path(figure.subplots(), run, position, field, planned, plan)
+    draw_path(figure.subplots(), run, position, field, planned)
     over = "the path" if field is None else f"the path over the map {field.name}"
     what = Trail.of(run).name.removesuffix(" [nT]")
-    return picture(figure, f"Path driven, coloured by {what}", alt=f"{over}, coloured by {what}", kind=kind)
+    return picture(figure, f"Path driven, coloured by {what}", alt=f"{over}, coloured by {what}", kind="png")
 
 
 @styled
@@ -338,7 +341,7 @@ def _title(run: Run, place: str | None) -> str:
     names = [str(run.metadata[key]) for key in ("scene", "path", "network") if run.metadata.get(key)]
     size = [f"{run.rows:,} readings", f"{run.duration_s:.1f} s"]
     if place is not None:
-        steps = np.diff(run[place][np.isfinite(run[place][:, :2]).all(axis=1), :2], axis=0)
+        steps = np.diff(_places(run, place), axis=0)
         size.append(f"{np.linalg.norm(steps, axis=1).sum():.1f} m")
     floor = swept(run.metadata).partition(",")[0]
     size += [floor] if floor else []

@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError
 from magtwin.figures.pictures import (
     BACKGROUND,
+    INK,
     LAB_ELEVATION_DEG,
     Camera,
     Cutaway,
     add_bar,
     add_still,
-    add_text,
     aim,
     check_png,
     check_size,
@@ -68,6 +68,9 @@ TRAIL_SPAN_M = 6.0
 
 UNKNOWN = (150, 150, 150)
 """Colour of the trail where the field is unknown."""
+
+LABEL: Any = {"position": (0.02, 0.93), "viewport": True, "color": INK}
+"""Place and colour of the line of text at the upper left."""
 
 SAMPLES = 4
 """Samples per pixel in frames of a film."""
@@ -187,7 +190,7 @@ class Scenery:
             if not fine:
                 self.plotter.disable_anti_aliasing()
                 self.plotter.enable_anti_aliasing("msaa", multi_samples=SAMPLES)
-            self._label = add_text(self.plotter, " ", max(8, round(size[1] / 60)))
+            self._label = self.plotter.add_text(" ", font_size=max(8, round(size[1] / 60)), **LABEL)
             self._label.prop.background_color, self._label.prop.background_opacity = BACKGROUND, 0.7
             self._cutaway = Cutaway(self.plotter, size, self._screens, list(self._actors.values()))
         except BaseException:

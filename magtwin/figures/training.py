@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from magtwin.figures.canvas import WIDTH_IN, label, legend_below, new_figure
+from magtwin.figures.canvas import WIDTH_IN, label, new_figure
 from magtwin.figures.style import DATA, FAINT, INK, MODEL, SOFT, styled
 from magtwin.learn.data.correlation import PAPER, Correlations
 from magtwin.learn.models.predictor import Epoch
@@ -37,7 +37,7 @@ def draw_learning_curve(
     label(ax, "epoch", "RMSE [nT]")
     ax.grid()
     ax.set_title(title)
-    legend_below(figure)
+    figure.legend(loc="outside lower center", ncols=2)
     return figure
 
 
@@ -65,5 +65,5 @@ def draw_correlations(correlations: Correlations) -> Figure:
     ax.axvline(0, color=FAINT, lw=0.8)
     label(ax, "Spearman's correlation with the disturbance")
     ax.grid(axis="x")
-    legend_below(figure, columns=1)
+    figure.legend(loc="outside lower center", ncols=1)
     return figure
