@@ -8,7 +8,7 @@ from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Dask, Flag, Force, Jobs, Names, Shard, Whole, pairs
-from magtwin.cli.terminal import Done, continued_by_a_repeat, progress, step
+from magtwin.cli.terminal import Done, continued_by_a_repeat, named, progress, step
 
 Results = Annotated[Path, Parameter(required=True)]
 
@@ -106,9 +106,8 @@ def report(*folders: Results, out: Path | None = None, force: Force = False) -> 
         Folder to make. Default: `report` in the first folder.
     """
     from magtwin.bench.report import report_results
-    from magtwin.files.outputs import free
 
-    (made,) = free(folders[0] / "report" if out is None else out, force=force)
+    made = named(folders[0] / "report" if out is None else out, force=force)
     step("Reading the results")
     report_results(folders, made, force=force)
     return Done(wrote=(made / "bench.html", made / "bench.json"), text="open bench.html in a browser")

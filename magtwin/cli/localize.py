@@ -8,7 +8,7 @@ from typing import Any
 from magtwin.cli.app import app
 from magtwin.cli.options import Force, Names, Seed, pairs, reads_recordings
 from magtwin.cli.ros import HERE, FramePrefix, WallS, Where, ros_app, spin
-from magtwin.cli.terminal import Done, announce, progress, step
+from magtwin.cli.terminal import Done, announce, named, progress, step
 from magtwin.errors import InputError, hint
 
 
@@ -74,7 +74,6 @@ def localize(
         Earlier run of the same session, with true poses.
     """
     from magtwin.figures.localization import save_localization
-    from magtwin.files.outputs import free
     from magtwin.io.formats import read_run
     from magtwin.localization.problem import OdometryModel, SensorModel
     from magtwin.tasks.localizing import ROBOT_NOISE, lever_arm_of, localization
@@ -82,7 +81,7 @@ def localize(
     step(f"Reading {run}")
     whole = read_run(run)
     told = _values("sensor", sensor, SensorModel)
-    (out,) = free(out, force=force)
+    out = named(out, force=force)
     with progress("Localizing", "readings") as advance:
         result = localization(
             whole,

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from math import radians
 from pathlib import Path
@@ -233,6 +234,14 @@ class Recorded:
         topics = pairs("remap", self.remap, OURS_THEIRS) | {n: t for n, t in chosen.items() if t}
         given = {"topics": topics or None, "unit": self.unit, "scale": self.scale}
         return {name: value for name, value in given.items() if value is not None}
+
+    def reading(self) -> AbstractContextManager[None]:
+        """Until its end, these options hold for all robots' bags, if any were given."""
+        if not self.options:
+            return nullcontext()
+        from magtwin.io.formats import recordings
+
+        return recordings(**self.options)
 
 
 RecordedOptions = Annotated[Recorded, Parameter(name="*")]

@@ -28,12 +28,11 @@ from magtwin.cli.options import (
     check_pace,
     reads_recordings,
 )
-from magtwin.cli.terminal import Done, announce, progress, silence, step
+from magtwin.cli.terminal import Done, announce, named, progress, silence, step
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
     from magtwin.ros.bus import Bus
-    from magtwin.spec.drive import DriveSpec
 
 ros_app = App(name="ros", help="Run the twin and its sensors as ROS 2 nodes.")
 app.command(ros_app)
@@ -263,11 +262,13 @@ def follow(
     continuous
         Drive until Ctrl-C.
     """
+    from magtwin.files.file import shipped
     from magtwin.path import resolve_path
     from magtwin.ros.follow import Follower
+    from magtwin.usd.robot import load_robot
 
     way = resolve_path(path)
-    drive = _drive_of(asset)
+    drive = load_robot(asset or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive
     with where.bus("magtwin_follow", sim_time=sim_time) as bus:
         options: Any = {"speed": speed, "controller": controller, "source": source, "laps": laps}
         options |= {"continuous": continuous, "commands": commands, "stamps": stamps, "say": announce}
@@ -308,11 +309,10 @@ def record(
     topic
         Topic to record beside those of the robot, such as /scan_2. May be repeated.
     """
-    from magtwin.files.outputs import free
     from magtwin.io.bags import RawBagWriter
     from magtwin.ros.record import Recorder
 
-    (out,) = free(out, force=force)
+    out = named(out, force=force)
     writer = RawBagWriter(out, force=force)
     try:
         with where.bus("magtwin_record", sim_time=sim_time, duration_s=duration_s) as bus:
@@ -400,14 +400,6 @@ def _announce_reach(bus: "Bus") -> None:
         _warn(f"every host on the network can find this node and send to it (interfaces: {names})")
     else:
         announce("only this machine can find this node; --discovery subnet opens it to the network")
-
-
-def _drive_of(asset: Path | None) -> "DriveSpec":
-    """Limits of a robot's drive."""
-    from magtwin.files.file import shipped
-    from magtwin.usd.robot import load_robot
-
-    return load_robot(asset or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive
 
 
 def _warn(text: str) -> None:

@@ -275,19 +275,14 @@ class _Trimmed(io.TextIOBase):
         sys.stdout.flush()
 
 
-def check_suffix(path: Path, suffixes: tuple[str, ...], what: str) -> None:
-    """Refuse an output whose name has another suffix."""
-    if path.suffix.lower() not in suffixes:
-        raise InputError(f"{path}: {what} ends in {' or '.join(suffixes)}")
-
-
 def named(
-    path: Path, suffixes: tuple[str, ...], what: str, *, beside: Sequence[str] = (), force: bool
+    path: Path, suffixes: Sequence[str] = (), what: str = "", *, beside: Sequence[str] = (), force: bool
 ) -> Path:
-    """A free name for an output of one of the suffixes: `magtwin.files.outputs.free`."""
+    """A free name for an output, of one of the suffixes if there are any: `magtwin.files.outputs.free`."""
     from magtwin.files.outputs import free
 
-    check_suffix(path, suffixes, what)
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise InputError(f"{path}: {what} ends in {' or '.join(suffixes)}")
     return free(path, beside=beside, force=force)[0]
 
 

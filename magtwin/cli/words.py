@@ -88,10 +88,8 @@ def _vocabulary() -> tuple[dict[str, dict[str, float]], dict[str, list[frozenset
                 if part == word:
                     weight *= 1.0 if word in groups else LESS.get(stem(word), 1.0)
                     known[command] = max(known.get(command, 0.0), weight)
-        pairs = (
-            *(word.split("-") for word in text.split() if "-" in word),
-            *([command.split()] if groups else ()),
-        )
+        pairs = [word.split("-") for word in text.split() if "-" in word]
+        pairs += [command.split()] if groups else []
         together[command] = [frozenset(map(stem, pair)) for pair in pairs]
     return single, together
 

@@ -7,7 +7,7 @@ from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import RECORDED, Force, Jobs, RecordedOptions, pairs
-from magtwin.cli.terminal import Done, progress, step
+from magtwin.cli.terminal import Done, named, progress, step
 from magtwin.errors import InputError
 
 dataset_app = App(name="dataset", help="Data sets: recordings with labels on a map, to train on.")
@@ -62,7 +62,6 @@ def build(
     jobs
         Number of processes that share the recordings. Default: one, with several threads.
     """
-    from magtwin.files.outputs import free
     from magtwin.learn.data.alignment import Alignment
     from magtwin.tasks.learning import build_dataset
 
@@ -74,7 +73,7 @@ def build(
     if len(set(columns.values())) < len(columns):
         raise InputError(f"--column names one column twice, got {' '.join(column or ())}")
     reading = recorded.options | ({"columns": columns} if columns else {})
-    (out,) = free(out, force=force)
+    out = named(out, force=force)
     with progress("Labelling", "recordings") as advance:
         made = build_dataset(
             run,

@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Flag, Force, Names, Seed, pairs, reads_recordings
-from magtwin.cli.terminal import Done, progress, step, width
+from magtwin.cli.terminal import Done, named, progress, step, width
 from magtwin.errors import InputError
 from magtwin.report.summary import aligned, clipped
 
@@ -79,7 +79,6 @@ def evaluate(
 
     from magtwin.figures.evaluations import NAME, page_of_evaluation
     from magtwin.figures.page import to_json, write_pages
-    from magtwin.files.outputs import free
     from magtwin.learn.evaluation.evaluation import TOTALS
     from magtwin.tasks.learning import error_budget, map_of_scene
     from magtwin.tasks.learning import evaluate as evaluate_models
@@ -93,7 +92,7 @@ def evaluate(
     cases = pairs("case", case, "a row of the table and its path, such as D=lawnmower.csv")
     if taken := cases.keys() & set(TOTALS):
         raise InputError(f"--case {min(taken)} is a row of the table already; take another name")
-    (out,) = free(out, force=force)
+    out = named(out, force=force)
     step("Reading maps, weights and recordings")
     with progress("Judging", "recordings") as advance:
         evaluation = evaluate_models(

@@ -23,7 +23,7 @@ from magtwin.cli.options import (
     check_pace,
 )
 from magtwin.cli.settings import RUN, RunOptions, RunSettings
-from magtwin.cli.terminal import Done, note, progress, step
+from magtwin.cli.terminal import Done, named, note, progress, step
 from magtwin.errors import InputError, find
 
 if TYPE_CHECKING:
@@ -52,11 +52,11 @@ def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False) -> D
     from magtwin.figures.pictures import picture_of_stage
     from magtwin.figures.reporting import report_runs
     from magtwin.files.file import shipped
-    from magtwin.files.outputs import free, output
+    from magtwin.files.outputs import output
     from magtwin.io.outputs import Outputs, drive
     from magtwin.twin import scene_from_toml
 
-    (out,) = free(out, force=force)
+    out = named(out, force=force)
     with output(out, force=force) as folder:
         step("Authoring the TurtleBot 4 from its URDF")
         source = shipped("robots", "turtlebot4")
@@ -179,8 +179,7 @@ def run(
         what = path = str(next(iter(robots.values())) or "figure8")
     step("Opening the scene")
     driven = _run_one(scene, outputs, what, path, settings, live=live, engine=engine, **options)
-    title = f"{path} in {scene.stem}"
-    made, told = outputs.targets, driven.run.report(title)
+    made, told = outputs.targets, driven.run.report(f"{path} in {scene.stem}")
     return Done(told, tuple(made), SHOWN, rest=f"magtwin info {made[0]}", next=look_at(made))
 
 
@@ -188,9 +187,8 @@ def look_at(written: list[Path]) -> list[tuple[object, ...]]:
     """What to type to see a run: its recording, and its page."""
     from magtwin.io.outputs import IN_FOLDER
 
-    files = [
-        file for out in written for file in ([out] if out.suffix else [out / name for name in IN_FOLDER])
-    ]
+    inside = [[out] if out.suffix else [out / name for name in IN_FOLDER] for out in written]
+    files = [file for each in inside for file in each]
     recording = next((file for file in files if file.suffix == ".rrd"), None)
     table = next((file for file in files if file.suffix != ".rrd"), files[0])
     shown: list[tuple[object, ...]] = [] if recording is None else [("magtwin", "view", recording)]
@@ -259,9 +257,8 @@ def _run_one(
     with ExitStack() as stack:
         keep = stack.enter_context(outputs.kept())
         places = stack.enter_context(outputs.aside())
-        with progress(
-            f"Driving {path}{' in Newton' if newton else ''}", "steps" if newton else ""
-        ) as advance:
+        how, unit = (" in Newton", "steps") if newton else ("", "")
+        with progress(f"Driving {path}{how}", unit) as advance:
             options |= {"progress": advance, "each": keep, "report": step, "metadata": replayed}
             driven = drive(scene, what, engine=engine, tell=note, **options)
         step("Writing the run")

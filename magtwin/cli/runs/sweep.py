@@ -19,7 +19,7 @@ from magtwin.cli.options import (
     Whole,
 )
 from magtwin.cli.settings import SWEEP, SweepOptions
-from magtwin.cli.terminal import Done, continued_by_a_repeat, progress, step
+from magtwin.cli.terminal import Done, continued_by_a_repeat, named, progress, step
 from magtwin.errors import InputError
 
 RUNS_A_SESSION = 5
@@ -82,7 +82,6 @@ def sweep(
         Number of processes. Default: one, with several threads.
     """
     from magtwin.files.kinds import scene_file
-    from magtwin.files.outputs import free
     from magtwin.io.outputs import driven_by
     from magtwin.parallel import parse_shard
     from magtwin.sim.motion.drive_input import drive_input
@@ -106,7 +105,7 @@ def sweep(
     for what in paths:
         drive_input(what)  # refuses a wrong name before the scene is opened
     part = None if shard is None else parse_shard(shard)
-    out = out if part else free(out, force=force)[0]  # shards share one folder
+    out = out if part else named(out, force=force)  # shards share one folder
     step("Opening the scene")
     twin = open_twin(
         scene,

@@ -69,14 +69,13 @@ def robot(
         Full report to write (.json).
     """
     given = dict(locals())
-    from magtwin.files.outputs import free, output, transaction
+    from magtwin.files.outputs import output, transaction
 
     if out.suffix.lower() in (".usd", ".usdc", ".usdz"):
-        raise InputError(
-            f"{out}: a robot is a folder, or one file .usda; give {out.stem}, or {out.stem}.usda"
-        )
+        give = f"give {out.stem}, or {out.stem}.usda"
+        raise InputError(f"{out}: a robot is a folder, or one file .usda; {give}")
     beside = {".usda": ("_meshes.usdc", "_textures"), ".urdf": ("_meshes",)}.get(out.suffix.lower(), ())
-    (out,) = free(out, beside=beside, force=force)
+    out = named(out, beside=beside, force=force)
     if out.suffix.lower() == ".urdf":
         from magtwin.author.from_urdf import write_urdf
 
