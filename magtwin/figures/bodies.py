@@ -46,9 +46,8 @@ def bodies_of(arrays: dict[str, Array], stage: Path, runs: Sequence[Run]) -> tup
         and side, pose and axis of a wheel.
     """
     try:
-        opened = open_scene(
-            stage, check_network=False, lab=str(runs[0].metadata.get("lab", "")) if runs else ""
-        )
+        lab = str(runs[0].metadata.get("lab", "")) if runs else ""
+        opened = open_scene(stage, check_network=False, lab=lab)
         shown, scene = opened.stage, opened.scene
     except InputError:
         if runs:
@@ -90,9 +89,8 @@ def _body_of(
 ) -> tuple[str, dict[str, Any]]:
     """Name of the body that a shape is a part of, and what is known of the body."""
     if shape.link not in robots:
-        robot = shape.link and any(
-            link.joint and link.base == links[shape.link].base for link in links.values()
-        )
+        bases = {link.base for link in links.values() if link.joint}
+        robot = shape.link and links[shape.link].base in bases
         return ("standing", {"name": "standing", "solid": 1}) if robot else ("lab", {"name": "lab"})
     link, k = links[shape.link], robots[shape.link]
     if link.joint in sides[k] and link.rolling_axis is not None:

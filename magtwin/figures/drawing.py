@@ -46,8 +46,7 @@ def draw(
 
     Args:
         files: One file, or two of one kind. Names of shipped scenes are stages.
-        out: File to write; its suffix says whether it is a picture or a film. None: a PNG in the working
-            folder, named after the first file.
+        out: Picture or film, by its suffix. None: a PNG in the working folder, named after the first file.
         show: What to draw of a run (charts, picture) or of a map and the map of a stage. None: charts of a
             run unless `at_s` or `camera` asks for a picture; a recording as the Rerun viewer shows it; mean,
             heading effect, standard deviation and gradient of a map; a stage as it looks.

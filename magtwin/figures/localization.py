@@ -70,12 +70,7 @@ def draw_localization(result: Localization) -> Figure:
     estimate's variances along x and y. The bound is the least standard deviation that any unbiased method
     can have with this map, see `magtwin.localization.bounds`.
 
-    Args:
-        result: Result of `magtwin.tasks.localizing.localization`. Without a true pose, the errors are left
-            out and the standard deviations are drawn alone.
-
-    Returns:
-        A matplotlib figure.
+    Without a true pose, the errors are left out and the standard deviations are drawn alone.
 
     Raises:
         InputError: There is no estimate.
@@ -256,11 +251,7 @@ def _title(result: Localization) -> str:
 def save_localization(result: Localization, out: str | os.PathLike[str], *, force: bool = False) -> Path:
     """Write the folder of a localization.
 
-    Args:
-        result: Result of `magtwin.tasks.localizing.localization`.
-        out: Folder to make, with run.parquet, localize.rrd, .png and .html, estimate.tum and, if the true
-            pose is known, truth.tum.
-        force: Whether to replace an existing folder.
+    It has run.parquet, localize.rrd, .png and .html, estimate.tum and, if the true pose is known, truth.tum.
 
     Raises:
         InputError: The folder exists, or cannot be written.

@@ -93,9 +93,6 @@ def draw_map(
             of more than eight. Ignored by the overview.
         plan: Walls, furniture and doors, drawn over each panel.
 
-    Returns:
-        A matplotlib figure.
-
     Raises:
         InputError: There is no map or no heading to show, or the map does not know the quantity.
     """
@@ -182,9 +179,8 @@ def draw_difference(difference: MapDifference) -> Figure:
         f"common bias {difference.bias_nt.mean():+.3g} nT",
         f"{changed} of {np.count_nonzero(count)} nodes changed, in {regions} region{'s' * (regions != 1)}",
         f"|z| from {difference.threshold_z:.2f}",
+        *([] if difference.from_variance else ["no variance is known: z by the robust spread"]),
     ]
-    if not difference.from_variance:
-        words.append("no variance is known: z by the robust spread")
     lines = [f"{names[0]} to {names[1]}", *textwrap.wrap(", ".join(words), 100)]
     figure.suptitle("\n".join(lines))
     legend = {"changed region": Patch(facecolor="none", edgecolor=INK)} if regions else {}
@@ -373,11 +369,7 @@ QUANTITIES: Mapping[str, _Quantity] = {
         "plasma",
         unknown="masked in some heading",
     ),
-    "sd": _Quantity(
-        lambda field: np.sqrt(np.mean(_sd_nt(field) ** 2, axis=0))[None],
-        "[nT]",
-        SPREAD_COLOURS,
-    ),
+    "sd": _Quantity(lambda field: np.sqrt(np.mean(_sd_nt(field) ** 2, axis=0))[None], "[nT]", SPREAD_COLOURS),
 }
 """Quantities of a map that can be drawn, by name."""
 

@@ -172,10 +172,6 @@ def picture_of_stage(
 def show_stage(path: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 1000)) -> None:
     """Show a stage in a window, where the mouse turns it; returns when the window is closed.
 
-    Args:
-        path: USD file.
-        size: Width and height of the window [pixel].
-
     Raises:
         InputError: The stage is missing, is not USD or shows nothing; or there is no display.
     """
@@ -269,11 +265,8 @@ def hides(triangles: Array, place: ArrayLike, points: Array) -> bool:
     with np.errstate(divide="ignore", invalid="ignore"):
         share = 1.0 / (across * e1).sum(axis=-1)
         turned = np.cross(off, e1)
-        u, v, t = (
-            (across * off).sum(-1) * share,
-            (ray * turned).sum(-1) * share,
-            (turned * e2).sum(-1) * share,
-        )
+        products = (across * off, ray * turned, turned * e2)
+        u, v, t = (product.sum(-1) * share for product in products)
         return bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < 0.999)).any())
 
 
@@ -359,11 +352,10 @@ def _draw(
     in_lab = scale is not None and any(s.prim == scale.prim for s in shapes)
     camera = camera or Camera(elevation_deg=LAB_ELEVATION_DEG if in_lab else Camera.elevation_deg)
     screens, walls, points = add_still(plotter, shapes, worlds, scale)
-    if camera.elevation_deg > 0 and all(
-        s.link for s in shapes
-    ):  # just below everything, in the colour of the background: only shadows on it are visible
+    if camera.elevation_deg > 0 and all(s.link for s in shapes):
         import pyvista
 
+        # just below everything, in the colour of the background: only shadows on it are visible
         low, high = everything.min(axis=0), everything.max(axis=0)
         reach = 3 * float(np.max(high - low))
         middle = (*((low + high) / 2)[:2], low[2] - 1e-3 * reach)
@@ -411,16 +403,14 @@ def plotter_of(size: tuple[int, int], *, window: bool = False) -> Any:
     """
     missing = [name for name in ("pyvista", "vtkmodules", "imageio_ffmpeg") if find_spec(name) is None]
     if missing:
-        raise InputError(
-            f"pictures and films of stages need {', '.join(missing)}: pip install 'magtwin[view]'"
-        )
+        needed = ", ".join(missing)
+        raise InputError(f"pictures and films of stages need {needed}: pip install 'magtwin[view]'")
     import vtkmodules.vtkRenderingOpenGL2
     from vtkmodules.vtkCommonCore import vtkLogger
     from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
-    refusal = InputError(
-        f"no OpenGL here, so no picture can be drawn; install it: apt-get install {GL_PACKAGES}"
-    )
+    remedy = f"install it: apt-get install {GL_PACKAGES}"
+    refusal = InputError(f"no OpenGL here, so no picture can be drawn; {remedy}")
     if sys.platform == "linux" and not _loads("libX11.so", "libX11.so.6"):  # needed without a screen too
         raise refusal
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # it reports each missing way to draw
@@ -456,12 +446,8 @@ def check_size(size: tuple[int, int]) -> None:
     """Refuse a size that cannot be drawn."""
     if not (min(size) >= 16 and max(size) <= 16384):
         raise InputError(f"size must lie in 16..16384 pixels each way, got {size[0]} x {size[1]}")
-    check_room(
-        BYTES_PER_PIXEL * size[0] * size[1],
-        f"a picture of {size[0]} x {size[1]} pixels",
-        "take a smaller `size`",
-        "size",
-    )
+    text = f"a picture of {size[0]} x {size[1]} pixels"
+    check_room(BYTES_PER_PIXEL * size[0] * size[1], text, "take a smaller `size`", "size")
 
 
 def write_png(image: NDArray[np.uint8], path: Path) -> None:
@@ -490,9 +476,8 @@ def mesh_of(shape: Shape, vertices: NDArray, *, baked: bool = False) -> Any:
     if shape.vertex_colours is not None:
         mesh["rgb"] = (255 * srgb_from_linear(shape.vertex_colours)).round().astype(np.uint8)
         return mesh
-    mesh = mesh.compute_normals(
-        cell_normals=False, split_vertices=True, feature_angle=35, consistent_normals=False
-    )
+    how: Any = {"cell_normals": False, "split_vertices": True, "consistent_normals": False}
+    mesh = mesh.compute_normals(feature_angle=35, **how)
     colour = (255 * np.array(srgb_from_linear(shape.colour[:3]))).round().astype(np.uint8)
     mesh["rgb"] = np.tile(colour, (mesh.n_points, 1))
     if baked:
@@ -623,14 +608,7 @@ class Cutaway:
     def __init__(
         self, plotter: Any, size: tuple[int, int], screens: Sequence[Any], robot: Sequence[Any] = ()
     ) -> None:
-        """Prepare the pictures of a rendered plotter.
-
-        Args:
-            plotter: The plotter.
-            size: Width and height [pixel].
-            screens: The actors that may hide the subject.
-            robot: The actors that nothing may hide.
-        """
+        """Pictures of a rendered plotter, whose actors `screens` may hide the subject, but not `robot`."""
         others = [a for a in plotter.renderer.actors.values() if not any(a is part for part in robot)]
         self._plotter, self._size = plotter, size
         self._hidden = [actors for actors in (list(screens), others if robot else []) if actors]

@@ -72,9 +72,6 @@ def draw_run(
         planned: The planned path in world [m], shape (M, 2). None leaves it out.
         plan: Walls, furniture and doors. None leaves them out.
 
-    Returns:
-        A matplotlib figure.
-
     Raises:
         InputError: The run has no rows, no clock, or no column of numbers.
     """
@@ -146,13 +143,10 @@ def panels_of(run: Run) -> list[Panel]:
     """The graphs that a run has columns for; of a run with none of the usual ones, its first columns."""
     panels = _residuals(run)
     grey, data, model = ({"color": ink} for ink in (SOFT, DATA, MODEL))
-    read = next(
-        (name for name in ("b_measured_nt", "b_total_nt", field_name(run)) if name and _has(run, name)), ""
-    )
-    fields = {
-        "reading" if read == "b_measured_nt" else read: (read, data),
-        "map": ("b_map_nt", model | DASHES),
-    }
+    columns = ("b_measured_nt", "b_total_nt", field_name(run))
+    read = next((name for name in columns if name and _has(run, name)), "")
+    first = "reading" if read == "b_measured_nt" else read
+    fields = {first: (read, data), "map": ("b_map_nt", model | DASHES)}
     speeds = {"driven": ("v_base", data), "commanded": ("v_cmd", model | DASHES)}
     if not _has(run, "v_base"):
         speeds["odometry"] = ("odom_v", grey)

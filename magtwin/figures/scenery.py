@@ -104,14 +104,11 @@ class View:
         except ValueError:
             x = math.nan
         if not (text.count(":") == 1 and math.isfinite(x) and all(map(math.isfinite, (y, z, tx, ty, tz)))):
-            raise InputError(
-                f"no camera {text!r}; known: {', '.join(KINDS)}; or x,y,z:x,y,z, from where to where",
-                parameter="camera",
-            )
+            known = f"known: {', '.join(KINDS)}; or x,y,z:x,y,z, from where to where"
+            raise InputError(f"no camera {text!r}; {known}", parameter="camera")
         if (x, y, z) == (tx, ty, tz):
-            raise InputError(
-                f"the camera {text!r} looks at its own place; give another target", parameter="camera"
-            )
+            said = f"the camera {text!r} looks at its own place; give another target"
+            raise InputError(said, parameter="camera")
         return cls("fixed", (x, y, z), (tx, ty, tz))
 
     def camera(self, seen_s: float = 0.0) -> Camera:
@@ -229,9 +226,8 @@ class Scenery:
             side = self._sides.get(link.joint)
             if side is not None and link.rolling_axis is not None:
                 half = self._wheels[k, side] / 2
-                T_base_link = T_base_link @ _matrix(
-                    (0, 0, 0), (*np.multiply(link.rolling_axis, np.sin(half)), np.cos(half))
-                )
+                turn = (*np.multiply(link.rolling_axis, np.sin(half)), np.cos(half))
+                T_base_link = T_base_link @ _matrix((0, 0, 0), turn)
             poses[name] = base @ T_base_link
         return poses
 
@@ -315,14 +311,10 @@ class Scenery:
             known = np.isfinite(trail.values[rows])
             share = (trail.values[rows][known] - low) / max(high - low, 1e-9)
             colours[known] = (255 * colormaps[trail.colours](share)[:, :3]).round().astype(np.uint8)
-            two = scale is not None and limits != trail.limits
-            add_bar(
-                self.plotter, trail.colours, trail.limits, trail.name.replace(" − ", "\n− "), "lower" * two
-            )
-            if scale is not None and two:
-                add_bar(
-                    self.plotter, scale.name, (scale.least, scale.greatest), f"map [{scale.unit}]", "upper"
-                )
+            two, title = limits not in (None, trail.limits), trail.name.replace(" − ", "\n− ")
+            add_bar(self.plotter, trail.colours, trail.limits, title, "lower" * two)
+            if scale is not None and limits is not None and two:
+                add_bar(self.plotter, scale.name, limits, f"map [{scale.unit}]", "upper")
         along = np.gradient(p_xy[rows], axis=0)
         along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
         left = np.column_stack([-along[:, 1], along[:, 0]])
@@ -359,16 +351,9 @@ def picture_of_run(
     size: tuple[int, int] = (1600, 1000),
     force: bool = False,
 ) -> Path:
-    """Draw a moment of a run in its lab, with the trail so far, and write a PNG.
+    """Draw a moment of a run in its lab, with the trail so far, and write a PNG of a `size` in pixels.
 
-    Args:
-        run: The run.
-        scene_file: Stage of its lab.
-        out: PNG to write.
-        time_s: Time on the run's clock [s]. Default: the end of the run.
-        camera: "top", "orbit" or "x,y,z:x,y,z", as for `View.of`.
-        size: Width and height [pixel].
-        force: Whether to replace an existing file.
+    Default of the time on the run's clock [s]: its end. `camera` is as for `View.of`.
 
     Raises:
         InputError: As for `Scenery`; or `out` is not a PNG or exists.
@@ -378,10 +363,8 @@ def picture_of_run(
         raise InputError("the run has no readings, so there is nothing to show")
     t = float(run["t"][-1]) if time_s is None else time_s
     if not run["t"][0] <= t <= run["t"][-1]:
-        raise InputError(
-            f"the run goes from {run['t'][0]:g} to {run['t'][-1]:g} s; there is no {t:g} s in it",
-            parameter="time_s",
-        )
+        ends = f"the run goes from {run['t'][0]:g} to {run['t'][-1]:g} s"
+        raise InputError(f"{ends}; there is no {t:g} s in it", parameter="time_s")
     with (
         output(out, force=force) as aside,
         Scenery(run, scene_file, [t], view=view, size=size, fine=True) as scenery,
@@ -433,10 +416,8 @@ def _steps(p_xy: Array) -> NDArray[np.intp]:
 
 def placed(points: ArrayLike, link: Link, *, in_base: bool = False) -> Array:
     """Points of a link in world, or in the base of its robot at rest [m], shape (N, 3)."""
-    pose = (
-        (link.p_base_link, link.q_base_link_xyzw) if in_base else (link.p_world_link, link.q_world_link_xyzw)
-    )
-    T = _matrix(*pose)
+    base, world = (link.p_base_link, link.q_base_link_xyzw), (link.p_world_link, link.q_world_link_xyzw)
+    T = _matrix(*(base if in_base else world))
     return np.asarray(points) @ T[:3, :3].T + T[:3, 3]
 
 
