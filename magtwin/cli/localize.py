@@ -83,22 +83,15 @@ def localize(
     told = _values("sensor", sensor, SensorModel)
     out = named(out, force=force)
     with progress("Localizing", "readings") as advance:
-        result = localization(
-            whole,
-            None if map == "none" else map,
-            method=method,
-            options=_values("option", option),
-            prior=prior,
-            sensor=replace(ROBOT_NOISE, **{"lever_arm_m": lever_arm_of(whole), **told}),
-            odometry=OdometryModel(**_values("odometry", odometry, OdometryModel)),
-            map_length_m=map_length_m,
-            compensator=compensator,
-            calibration=calibration,
-            rate_hz=rate_hz,
-            seed=seed,
-            keep_particles=True,
-            progress=advance,
-        )
+        noise: Any = {
+            "sensor": replace(ROBOT_NOISE, **{"lever_arm_m": lever_arm_of(whole), **told}),
+            "odometry": OdometryModel(**_values("odometry", odometry, OdometryModel)),
+            "map_length_m": map_length_m,
+        }
+        how: Any = {"method": method, "options": _values("option", option), "prior": prior, "seed": seed}
+        how |= {"compensator": compensator, "calibration": calibration, "rate_hz": rate_hz}
+        on = None if map == "none" else map
+        result = localization(whole, on, keep_particles=True, progress=advance, **noise, **how)
     step("Writing the estimate")
     save_localization(result, out, force=force)
     errors = ("position error, RMSE", "heading error, RMSE", "dead reckoning, RMSE")

@@ -72,22 +72,18 @@ def build(
     columns = pairs("column", column, "NAME=THEIRS, such as yaw=heading")
     if len(set(columns.values())) < len(columns):
         raise InputError(f"--column names one column twice, got {' '.join(column or ())}")
+    how: Any = {
+        "session_by": session_by,
+        "path_by": path_by,
+        "rate_hz": rate_hz,
+        "jobs": jobs,
+        "force": force,
+    }
+    how["alignment"] = "fit" if alignment == "fit" else known
     reading = recorded.options | ({"columns": columns} if columns else {})
     out = named(out, force=force)
     with progress("Labelling", "recordings") as advance:
-        made = build_dataset(
-            run,
-            out=out,
-            anomaly_map=map,
-            alignment="fit" if alignment == "fit" else known,
-            session_by=session_by,
-            path_by=path_by,
-            rate_hz=rate_hz,
-            jobs=jobs,
-            force=force,
-            progress=advance,
-            **reading,
-        )
+        made = build_dataset(run, out=out, anomaly_map=map, progress=advance, **how, **reading)
     train = ("magtwin", "train", out, "--out", f"{out.name}.safetensors")
     return Done(made.report(), out, next=(train, ("magtwin", "dataset", "info", out)))
 

@@ -95,17 +95,9 @@ def evaluate(
     out = named(out, force=force)
     step("Reading maps, weights and recordings")
     with progress("Judging", "recordings") as advance:
-        evaluation = evaluate_models(
-            weights,
-            dataset or runs or [],
-            anomaly_map=map or ([] if scene is None else [map_of_scene(scene)]),
-            train=train,
-            cases=cases,
-            any_map=any_map,
-            truth=truth,
-            seed=seed,
-            progress=advance,
-        )
+        how: Any = {"train": train, "cases": cases, "any_map": any_map, "truth": truth, "seed": seed}
+        how["anomaly_map"] = map or ([] if scene is None else [map_of_scene(scene)])
+        evaluation = evaluate_models(weights, dataset or runs or [], progress=advance, **how)
     budgets: tuple[Any, ...] = ()
     if scene is not None and train is not None:
         with progress("Error budgets", "models") as advance:

@@ -315,15 +315,8 @@ def _run_robots(
             aside = stack.enter_context(replace(own[name], folder=None).aside())
             places[name] = replace(aside, folder=folder)
         with progress(f"Driving {', '.join(ways)}") as advance:
-            runs = simulate_robots(
-                twin,
-                ways,
-                robots=names,
-                meet=meet,
-                progress=advance,
-                each=lambda name, block: kept[name](block),
-                **options,
-            )
+            options |= {"robots": names, "meet": meet, "each": lambda name, block: kept[name](block)}
+            runs = simulate_robots(twin, ways, progress=advance, **options)
         step("Writing the runs")
         for name, run in runs.items():
             its = led_by(twin, name)

@@ -1,6 +1,7 @@
 """`magtwin sweep`."""
 
 from pathlib import Path
+from typing import Any
 
 from magtwin.cli.app import app
 from magtwin.cli.options import (
@@ -107,29 +108,14 @@ def sweep(
     part = None if shard is None else parse_shard(shard)
     out = out if part else named(out, force=force)  # shards share one folder
     step("Opening the scene")
-    twin = open_twin(
-        scene,
-        lab=settings.lab,
-        map_layer=map_layer,
-        network=settings.network,
-        magnetometer=magnetometer,
-        model_error=settings.model_error,
-        tracking_error=settings.tracking_error,
-    )
-    runs = drive_many(
-        twin,
-        [drive_input(what, room_of(twin), fit=fit) for what in paths],
-        count,
-        seed=seed,
-        sessions=sessions or max(1, round(count / RUNS_A_SESSION)),
-        plant=plant,
-        speeds=speed if speed is not None else 0.2 if sessions == "survey" else "drawn",
-        columns=settings.keep,
-        duration_s=duration_s,
-        rate_hz=rate_hz,
-        lidar=settings.lidar,
-        outside=settings.outside,
-    )
+    opened = {name: getattr(settings, name) for name in ("lab", "network", "model_error", "tracking_error")}
+    twin = open_twin(scene, map_layer=map_layer, magnetometer=magnetometer, **opened)
+    ways = [drive_input(what, room_of(twin), fit=fit) for what in paths]
+    how: Any = {"seed": seed, "plant": plant, "duration_s": duration_s, "rate_hz": rate_hz}
+    how |= {"columns": settings.keep, "lidar": settings.lidar, "outside": settings.outside}
+    how["sessions"] = sessions or max(1, round(count / RUNS_A_SESSION))
+    how["speeds"] = speed if speed is not None else 0.2 if sessions == "survey" else "drawn"
+    runs = drive_many(twin, ways, count, **how)
     kept = jobs is not None or part is not None or dask is not None
     with continued_by_a_repeat(when=kept), progress("Driving", "runs") as advance:
         made = runs.save(out, force=force, jobs=jobs, shard=part, dask=dask, progress=advance)

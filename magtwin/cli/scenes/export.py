@@ -2,7 +2,7 @@
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force
@@ -68,16 +68,10 @@ def export(
         from magtwin.io.formats import read_run
 
         animation = read_run(existing(run, "run"))
-    made = export_scene(
-        stage,
-        out,
-        profile=target,
-        animation=animation,
-        to_onnx=_write_onnx if onnx and find_spec("onnx") and find_spec("onnxruntime") else None,
-        thumbnail=_draw if thumbnail and target != "viewer" else None,
-        force=force,
-        progress=step,
-    )
+    how: Any = {"profile": target, "animation": animation, "force": force, "progress": step}
+    how["to_onnx"] = _write_onnx if onnx and find_spec("onnx") and find_spec("onnxruntime") else None
+    how["thumbnail"] = _draw if thumbnail and target != "viewer" else None
+    made = export_scene(stage, out, **how)
     check = ("magtwin", "validate", made.root)
     return Done(made.report(), tuple(made.files), next=() if out.suffix.lower() == ".glb" else (check,))
 
