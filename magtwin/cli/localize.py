@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Names, Seed, pairs, reads_recordings
+from magtwin.cli.options import AnyRun, Folder, Force, Names, Seed, pairs, reads_recordings
 from magtwin.cli.ros import HERE, FramePrefix, WallS, Where, ros_app, spin
 from magtwin.cli.terminal import Done, announce, named, progress, step
 from magtwin.errors import InputError, hint
@@ -15,12 +15,12 @@ from magtwin.errors import InputError, hint
 @app.command
 @reads_recordings
 def localize(
-    run: Path,
+    run: AnyRun,
     *,
     map: str,  # noqa: A002 - the option is called --map
     method: str = "rbpf-iron",
     option: Names = None,
-    out: Path = Path("localized"),
+    out: Folder = Path("localized"),
     prior: str = "tracking",
     rate_hz: float = 5.0,
     sensor: Names = None,
@@ -40,8 +40,6 @@ def localize(
 
     Parameters
     ----------
-    run
-        A run in any format that magtwin reads.
     map
         Map layer, stage, folder of survey CSVs, or the name of a scene that ships with magtwin (lab). none:
         no map, for the methods of simultaneous localization and mapping, such as incremental-slam.
@@ -50,8 +48,6 @@ def localize(
         folder or an installed package.
     option
         Options of the method, as NAME=VALUE.
-    out
-        Folder to make.
     prior
         Start that the method is told: tracking (the true pose with errors of 0.1 m and 5 deg), heading (the
         heading within 10 deg; no position), global (nothing), or a pose x,y,yaw [m, m, rad]. For a negative

@@ -85,6 +85,8 @@ def headings_rad(text: str) -> list[float]:
     return [radians(h) for h in degrees]
 
 
+Folder = Annotated[Path, Parameter(help="Folder to make.")]
+AnyRun = Annotated[Path, Parameter(help="A run in any format that magtwin reads.")]
 Whole = Annotated[int, Parameter(converter=_whole)]
 Flag = Annotated[bool, Parameter(negative="")]
 Names = Annotated[list[str] | None, Parameter(consume_multiple=True)]

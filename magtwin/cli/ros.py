@@ -12,6 +12,7 @@ from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import (
+    AnyRun,
     Flag,
     Force,
     Lab,
@@ -337,7 +338,7 @@ def record(
 @ros_app.command(name="replay")
 @reads_recordings
 def replay(
-    run: Path,
+    run: AnyRun,
     *,
     topic: tuple[str, ...] = (),
     scene: Path | None = None,
@@ -352,8 +353,6 @@ def replay(
 
     Parameters
     ----------
-    run
-        A run in any format that magtwin reads.
     topic
         Topic to publish. May be repeated. Default: all.
     scene

@@ -73,7 +73,7 @@ class Done:
             f"{' and '.join(renamed)} exist{'s' if len(renamed) == 1 else ''}: wrote" if renamed else "Wrote"
         )
         said = f"{said} {listed(wrote, WIDTH)}" if wrote else ""
-        if not (_mode.json or _mode.quiet):
+        if not any(_mode.values()):
             told = ": ".join(filter(None, (said, self.text or _inside(wrote))))
             tail = [f"{told}; --force replaces" if renamed else told] if told else []
             tail += [f"{'       ' if k else 'Next:  '}{words}" for k, words in enumerate(following)]
@@ -81,7 +81,7 @@ class Done:
                 say(line)
         elif renamed:
             print_error(said)
-        if _mode.json:
+        if _mode["json"]:
             data = self.data
             if data is None:
                 data = {} if self.report is None else json.loads(self.report.to_json())
@@ -194,40 +194,33 @@ def print_json(data: Any) -> None:
     print("".join(c if c.isprintable() or c == "\n" else json.dumps(c)[1:-1] for c in text))  # noqa: T201
 
 
-@dataclass
-class _Mode:
-    """What --json and --quiet of the command said."""
-
-    json: bool = False
-    quiet: bool = False
-
-
-_mode = _Mode()
+_mode = {"json": False, "quiet": False}
+"""What --json and --quiet of the command said."""
 
 
 @contextmanager
 def output_mode(*, as_json: bool, quiet: bool) -> Iterator[None]:
     """Print JSON, or nothing, until the end of the block."""
-    before = _mode.json, _mode.quiet
-    _mode.json, _mode.quiet = as_json, quiet
+    before = dict(_mode)
+    _mode.update(json=as_json, quiet=quiet)
     watch = current()
     watch.announces, watch.mute = not as_json, quiet
     try:
         yield
     finally:
-        _mode.json, _mode.quiet = before
+        _mode.update(before)
 
 
 def say(text: str) -> None:
     """Print a line on stdout; nothing with --json or --quiet."""
-    if not (_mode.json or _mode.quiet):
+    if not any(_mode.values()):
         current().clear()
         print(printable_lines(text))  # noqa: T201
 
 
 def note(text: str) -> None:
     """Print an indented line on stderr; nothing with --quiet."""
-    if not _mode.quiet:
+    if not _mode["quiet"]:
         current().clear()
         print(f"  {printable_lines(text)}", file=sys.stderr)  # noqa: T201
 

@@ -34,12 +34,8 @@ MAP_PRIM = "/AnomalyMap"
 def bodies_of(arrays: dict[str, Array], stage: Path, runs: Sequence[Run]) -> tuple[list[dict[str, Any]], int]:
     """The bodies of a scene, and the number of shapes that are left out.
 
-    Adds the points of each body to `arrays`, in 1/65535 of its box, its faces and colours.
-
-    Args:
-        arrays: Arrays of the page by name.
-        stage: The scene.
-        runs: The robots that move, in the order of the page. None move without a run.
+    Adds the points of each body to `arrays`, in 1/65535 of its box, its faces and colours. The robots of the
+    runs move, in the order of the page.
 
     Returns:
         Boxes of the bodies; whether it is part of a robot, `solid`; the number of its robot if a body moves;

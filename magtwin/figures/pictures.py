@@ -286,14 +286,9 @@ def add_still(
     *,
     baked: bool = False,
 ) -> tuple[list[Any], Walls, Array]:
-    """Draw what stands still, as one body per look.
+    """Draw what stands still, by its vertices in world [m], as one body per look.
 
-    Args:
-        plotter: The plotter.
-        shapes: The shapes.
-        worlds: Their vertices in world [m].
-        scale: Colour scale of the heat-map, or None.
-        baked: Whether light is put into the colours, so that no frame computes it.
+    If `baked`, light is put into the colours, so that no frame computes it.
 
     Returns:
         The actors that may hide heat-map and robot; the walls; and points of all that a wall must not hide
@@ -543,15 +538,10 @@ def light(plotter: Any, everything: NDArray, *, soft: bool = True) -> None:
 def aim(
     plotter: Any, camera: Camera, everything: NDArray, size: tuple[int, int], *, bar: bool = False
 ) -> None:
-    """Set the camera; without a distance, it sees everything.
+    """Set the camera; without a distance, it sees all points [m], shape (N, 3).
 
-    Args:
-        plotter: The plotter.
-        camera: The camera.
-        everything: Points to keep in view [m], shape (N, 3).
-        size: Width and height [pixel].
-        bar: Whether to keep the points to the left of a colour bar. A camera with a distance has its target
-            in the middle all the same.
+    They are kept to the left of a colour bar, if there is one; a camera with a distance has its target in the
+    middle all the same.
     """
     axes, target = camera.axes(), np.array(camera.target, float)
     if camera.target is None:

@@ -153,14 +153,8 @@ class Scenery:
     ) -> None:
         """Build the scenery.
 
-        Args:
-            run: The run, with t and a position: the truth, motion capture or odometry.
-            scene_file: Stage of its lab.
-            times: Ascending times of the frames on the run's clock [s].
-            view: The camera.
-            size: Width and height [pixel].
-            speed: Playback speed relative to the run.
-            fine: Whether to draw smoother edges and shadows in corners, which takes seconds per frame.
+        The run has t and a position: the truth, motion capture or odometry. The times of the frames ascend on
+        its clock [s]. `fine` draws smoother edges and shadows in corners, which takes seconds per frame.
 
         Raises:
             InputError: A column is missing, a time lies outside the run, the stage shows nothing or has no

@@ -32,15 +32,28 @@ def view(files: Sequence[Source], *, scene: Source | None = None) -> None:
     Raises:
         InputError: A file cannot be read, or there is no viewer.
     """
+    from magtwin.io.rerun.file import show_run
+    from magtwin.io.rerun.viewer import show
+    from magtwin.usd.animation import is_animation
+
     paths = [shipped_or(file) for file in files]
     if not paths:
         raise InputError("name a run or a stage to view")
     if len(paths) > 1:
         _view_together(paths, scene)
-    elif paths[0].suffix.lower() in USD_SUFFIXES and not paths[0].is_dir():
-        _view_stage(paths[0])
+        return
+    file, suffix = paths[0], paths[0].suffix.lower()
+    is_usd = suffix in USD_SUFFIXES and not file.is_dir()
+    existing(file, "stage" if is_usd else "run")
+    if is_usd and (suffix == ".usdz" or not is_animation(file)):
+        from magtwin.figures.pictures import show_stage
+
+        show_stage(file)
+    elif suffix == ".rrd" and scene is None:
+        show(file)
     else:
-        _view_run(paths[0], scene)
+        run = read_run(file)
+        show_run(run, twin_to_show(run, file, file if is_usd else scene), file=file)
 
 
 def compare_files(
@@ -103,18 +116,6 @@ def run_and_scene(file: Path, scene: Source | None) -> tuple[Run, Path]:
     return run, stage
 
 
-def _view_run(file: Path, scene: Source | None) -> None:
-    from magtwin.io.rerun.file import show_run
-    from magtwin.io.rerun.viewer import show
-
-    existing(file, "run")
-    if file.suffix.lower() == ".rrd" and scene is None:
-        show(file)
-    else:
-        run = read_run(file)
-        show_run(run, twin_to_show(run, file, scene), file=file)
-
-
 def _view_together(files: Sequence[Path], scene: Source | None) -> None:
     from magtwin.io.rerun.file import write_comparison
     from magtwin.io.rerun.viewer import show
@@ -128,15 +129,3 @@ def _view_together(files: Sequence[Path], scene: Source | None) -> None:
         rrd = Path(folder) / "runs.rrd"
         write_comparison(runs, rrd, twin)
         show(rrd, source=files[0])
-
-
-def _view_stage(file: Path) -> None:
-    from magtwin.usd.animation import is_animation
-
-    existing(file, "stage")
-    if file.suffix.lower() != ".usdz" and is_animation(file):
-        _view_run(file, file)
-    else:
-        from magtwin.figures.pictures import show_stage
-
-        show_stage(file)

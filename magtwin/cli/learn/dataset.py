@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import RECORDED, Force, Jobs, RecordedOptions, pairs
+from magtwin.cli.options import RECORDED, Folder, Force, Jobs, RecordedOptions, pairs
 from magtwin.cli.terminal import Done, named, progress, step
 from magtwin.errors import InputError
 
@@ -21,7 +21,7 @@ def build(
     run: Annotated[list[Path], Parameter(negative="")],
     *,
     map: Path,  # noqa: A002
-    out: Path,
+    out: Folder,
     alignment: Literal["fit", "none"] = "none",
     lever_arm_m: tuple[float, float] | None = None,
     latency_s: float | None = None,
@@ -42,8 +42,6 @@ def build(
         folder that `magtwin sweep` made stands for all of its runs.
     map
         Map that the labels are made on: a layer or stage, or a folder of survey CSVs.
-    out
-        Folder to make.
     alignment
         fit: fit the sensor's lever arm and latency to all recordings; none: use pose and reading as they are.
     lever_arm_m
@@ -72,14 +70,8 @@ def build(
     columns = pairs("column", column, "NAME=THEIRS, such as yaw=heading")
     if len(set(columns.values())) < len(columns):
         raise InputError(f"--column names one column twice, got {' '.join(column or ())}")
-    how: Any = {
-        "session_by": session_by,
-        "path_by": path_by,
-        "rate_hz": rate_hz,
-        "jobs": jobs,
-        "force": force,
-    }
-    how["alignment"] = "fit" if alignment == "fit" else known
+    how: Any = {"session_by": session_by, "path_by": path_by, "rate_hz": rate_hz, "jobs": jobs}
+    how |= {"alignment": "fit" if alignment == "fit" else known, "force": force}
     reading = recorded.options | ({"columns": columns} if columns else {})
     out = named(out, force=force)
     with progress("Labelling", "recordings") as advance:

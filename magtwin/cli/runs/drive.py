@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Gamepad, Lab, MapLayer, Network, Plant, Seed, Session
+from magtwin.cli.options import Folder, Force, Gamepad, Lab, MapLayer, Network, Plant, Seed, Session
 from magtwin.cli.runs.run import SHOWN, save_picture
 from magtwin.cli.terminal import Done, named, note, silence, step
 from magtwin.errors import InputError
@@ -27,7 +27,7 @@ STATUS_HZ = 10.0
 def drive(
     scene: Path,
     *,
-    out: Path = Path("drive"),
+    out: Folder = Path("drive"),
     lab: Lab = "",
     map_layer: MapLayer = None,
     gamepad: Gamepad = None,
@@ -48,8 +48,6 @@ def drive(
     ----------
     scene
         USD stage to drive in, or the name of a scene that ships with magtwin: lab.
-    out
-        Folder to make.
     live
         Show the drive in a Rerun viewer while it goes on, if a window can be opened.
     """

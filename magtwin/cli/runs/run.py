@@ -12,6 +12,7 @@ from cyclopts import Parameter
 from magtwin.cli.app import app
 from magtwin.cli.options import (
     Flag,
+    Folder,
     Force,
     Lab,
     Magnetometer,
@@ -36,16 +37,11 @@ SHOWN = ("duration", "distance driven", "readings", "b_total_nt", "error")
 
 
 @app.command
-def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False) -> Done:
+def demo(*, out: Folder = Path("demo"), seed: Seed = 0, force: Force = False) -> Done:
     """Author a lab and a TurtleBot 4, drive a figure of eight and log what the magnetometer reads.
 
     It writes the stages, run.html (plays the run in a browser), run.rrd (opens in Rerun), run.parquet and
     pictures, in less than a minute.
-
-    Parameters
-    ----------
-    out
-        Folder to make.
     """
     from magtwin.author.robot import build_robot
     from magtwin.author.scene import author_scene

@@ -7,6 +7,7 @@ from magtwin.cli.app import app
 from magtwin.cli.options import (
     Dask,
     Flag,
+    Folder,
     Force,
     Jobs,
     Magnetometer,
@@ -31,7 +32,7 @@ RUNS_A_SESSION = 5
 def sweep(
     scene: Path,
     *,
-    out: Path = Path("runs"),
+    out: Folder = Path("runs"),
     count: Whole = 100,
     path: Names = None,
     fit: Flag = False,
@@ -64,8 +65,6 @@ def sweep(
     ----------
     scene
         USD stage to drive in, or the name of a scene that ships with magtwin: lab.
-    out
-        Folder to make.
     count
         Number of runs.
     path
