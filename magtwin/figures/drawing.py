@@ -47,9 +47,8 @@ def draw(
     Args:
         files: One file, or two of one kind. Names of shipped scenes are stages.
         out: Picture or film, by its suffix. None: a PNG in the working folder, named after the first file.
-        show: What to draw of a run (charts, picture) or of a map and the map of a stage. None: charts of a
-            run unless `at_s` or `camera` asks for a picture; a recording as the Rerun viewer shows it; mean,
-            heading effect, standard deviation and gradient of a map; a stage as it looks.
+        show: What to draw of a run, or of a map, a stage's too. None: charts of a run unless `at_s` or
+            `camera` asks for a picture; a recording as its viewer shows it; a map's overview; a stage.
         force: Whether an existing output is replaced.
         advance: Called with the frames of a film that are drawn, and their number.
         options: at_s [s], camera, size [pixels], scene, headings [rad], pace and fps, as far as what is drawn
@@ -166,11 +165,6 @@ def _draw(
 
         named = named_run("", read_run(path), given.get("scene"), path)
         save(draw_run(named.run, named.field, named.planned), out, force=force)
-    elif way == "film":
-        from magtwin.figures.films import film_of_run
-
-        run, stage = views.run_and_scene(path, given.pop("scene", None))
-        film_of_run(run, stage, out, speed=given.pop("pace", None), force=force, advance=advance, **given)
     elif way == "recording":
         from magtwin.io.rerun.viewer import screenshot
 
@@ -182,8 +176,12 @@ def _draw(
         given |= {"camera": View.of(given["camera"]).camera()} if "camera" in given else {}
         picture_of_stage(path, out, force=force, **given)
     else:
+        from magtwin.figures.films import film_of_run
         from magtwin.figures.scenery import picture_of_run
 
         run, stage = views.run_and_scene(path, given.pop("scene", None))
-        picture_of_run(run, stage, out, time_s=given.pop("at_s", None), force=force, **given)
+        if way == "film":
+            film_of_run(run, stage, out, speed=given.pop("pace", None), force=force, advance=advance, **given)
+        else:
+            picture_of_run(run, stage, out, time_s=given.pop("at_s", None), force=force, **given)
     return ()

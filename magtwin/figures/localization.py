@@ -259,15 +259,10 @@ def save_localization(result: Localization, out: str | os.PathLike[str], *, forc
     with output(out, force=force) as folder:
         folder.mkdir()
         result.run.save(folder / "run.parquet")
-        write_localization(
-            result.run,
-            folder / "localize.rrd",
-            anomaly_map=_map_of(result),
-            truth=result.truth,
-            dead_reckoning=None if result.dead_reckoning is None else result.dead_reckoning.pose,
-            bound_m=None if result.bounds is None else result.bounds.correlated,
-            particles=result.track.particles,
-        )
+        shown: dict[str, Any] = {"anomaly_map": _map_of(result), "particles": result.track.particles}
+        shown["dead_reckoning"] = None if result.dead_reckoning is None else result.dead_reckoning.pose
+        shown["bound_m"] = None if result.bounds is None else result.bounds.correlated
+        write_localization(result.run, folder / "localize.rrd", truth=result.truth, **shown)
         save(draw_localization(result), folder / "localize.png")
         (folder / "localize.html").write_text(to_html(page_of_localization(result)), encoding="utf-8")
         _save_tum(folder / "estimate.tum", result.track.t, result.track.pose)

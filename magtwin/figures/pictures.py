@@ -375,14 +375,8 @@ def view_distance(
     A point at (r, u, b) along the camera's right, up and back axes is D - b in front of it, and is visible
     if |r| <= (D - b) tan(h) and |u| <= (D - b) tan(v).
 
-    Args:
-        points: Points in world [m], shape (N, 3).
-        target: Point in the middle of the view [m], shape (3,).
-        axes: Right, up and back axes of the camera in world, as rows, shape (3, 3).
-        half_angles: Half the horizontal and vertical angle of view [rad].
-
-    Returns:
-        Distance D from the target [m].
+    The points, shape (N, 3), and the target in the middle of the view are in world [m]; the axes, right, up
+    and back, are rows. `half_angles` h and v are half the horizontal and vertical angle of view [rad].
     """
     r, u, b = ((np.asarray(points, float) - target) @ np.asarray(axes, float).T).T
     h, v = half_angles

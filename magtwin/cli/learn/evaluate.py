@@ -107,13 +107,9 @@ def evaluate(
     page = page_of_evaluation(evaluation, budgets=budgets, both=both)
     write_pages(page, out, NAME, force=force)
     html = out / f"{NAME}.html"
-    return Done(
-        lines=_lines(evaluation),
-        wrote=(html, html.with_suffix(".json")),
-        data=loads(to_json(page)),
-        rest=str(html),
-        next=[("magtwin", "info", weights[0])],
-    )
+    wrote, following = (html, html.with_suffix(".json")), [("magtwin", "info", weights[0])]
+    data, lines = loads(to_json(page)), _lines(evaluation)
+    return Done(lines=lines, wrote=wrote, data=data, rest=str(html), next=following)
 
 
 def _overlaid(evaluation: "Evaluation", overlay: Path) -> "tuple[Traversals, tuple[str, str]]":

@@ -141,14 +141,8 @@ def run(
     from magtwin.usd.scene import robots_in
 
     scene = scene_file(scene)
-    outputs = Outputs.of(
-        out or [Path("run")],
-        scans=scans,
-        force=force,
-        out_unit=settings.out_unit,
-        usd_fps=settings.usd_fps,
-        picture=save_picture,
-    )
+    formats: Any = {"scans": scans, "out_unit": settings.out_unit, "usd_fps": settings.usd_fps}
+    outputs = Outputs.of(out or [Path("run")], force=force, picture=save_picture, **formats)
     what = None if path is None else driven_by(path)
     options: dict[str, Any] = {"seed": seed, "session": session, "plant": plant, "speed": speed}
     options |= {"duration_s": duration_s, "network": network, "magnetometer": magnetometer, "fit": fit}
