@@ -77,12 +77,17 @@ class Node:
             raise InputError(f"--duration-s is at most {LONGEST_S:g} s; leave it out to go on until Ctrl-C")
         from magtwin.compiled import steady
         from magtwin.ros.bus import names_of, open_bus
+        from magtwin.ros.bus.names import interfaces
 
         space = ("" if several else "robot") if self.namespace is None else self.namespace
         place: Any = {"backend": self.backend, "domain": self.domain, "discovery": self.discovery}
         names = names_of(space, self.remap)
         bus = open_bus(self.node_name or name, names=names, sim_time=sim_time, **place)
-        _announce_reach(bus)
+        if bus.reach == "subnet":
+            hosts = ", ".join(interfaces()) or "none"
+            _warn(f"every host on the network can find this node and send to it (interfaces: {hosts})")
+        else:
+            announce("only this machine can find this node; --discovery subnet opens it to the network")
         signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a script ignore it
         try:
             with suppress(KeyboardInterrupt), steady():
@@ -388,17 +393,6 @@ def spin(bus: "Bus", duration_s: float | None) -> None:
             bus.spin_once(0.1)
             if duration_s is not None:
                 advance(gone, duration_s)
-
-
-def _announce_reach(bus: "Bus") -> None:
-    """Which machines reach the node."""
-    from magtwin.ros.bus.names import interfaces
-
-    if bus.reach == "subnet":
-        names = ", ".join(interfaces()) or "none"
-        _warn(f"every host on the network can find this node and send to it (interfaces: {names})")
-    else:
-        announce("only this machine can find this node; --discovery subnet opens it to the network")
 
 
 def _warn(text: str) -> None:

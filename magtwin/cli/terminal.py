@@ -100,7 +100,11 @@ class Done:
         flags = [figure for figure in report.figures if FLAG in figure.name]
         lines = [_bold(report.title), *([_bold(report.verdict)] if report.verdict else [])]
         if self.whole:
-            return [*lines, *_rows(report.figures), *_facts(report.metadata)]
+            words = [
+                (name, str(each)) for name, each in report.metadata.items() if not isinstance(each, LISTS)
+            ]
+            lists = [line for name, each in report.metadata.items() for line in _notes(name, each)]
+            return [*lines, *_rows(report.figures), *aligned([row for row in words if row[1]]), *lists]
         chosen = [named[name] for name in self.figures if name in named]
         if not self.figures:
             chosen = [figure for figure in report.figures if figure not in flags]
@@ -157,13 +161,6 @@ def _rows(figures: Sequence[Any], *, clip: bool = False) -> list[str]:
         numbers.append((figure.name, shown, f"{spread}{figure.unit}", figure.note))
     lines = [*aligned(numbers, right=(1,)), *aligned(words)]
     return [clipped(line, columns) if clip and columns else line for line in lines]
-
-
-def _facts(metadata: dict[str, Any]) -> list[str]:
-    """All metadata: words by name, and then lists."""
-    words = [(name, str(each)) for name, each in metadata.items() if not isinstance(each, LISTS)]
-    lists = [line for name, each in metadata.items() for line in _notes(name, each)]
-    return [*aligned([row for row in words if row[1]]), *lists]
 
 
 def _notes(name: str, entry: Any, *, brief: bool = False) -> list[str]:

@@ -139,12 +139,10 @@ def as_of_today(arguments: list[str]) -> list[str]:
     for count in (2, 1):
         if new := OLD.get(" ".join(arguments[:count])):
             command, _, show = new.partition(" --show")
-            rest = [_renamed(word) if command == "plot" else word for word in arguments[count:]]
+            rest = arguments[count:]
+            if command == "plot":
+                parts = [word.partition("=") for word in rest]
+                rest = [OLD_OPTIONS.get(name, name) + equals + value for name, equals, value in parts]
             told = any(word.partition("=")[0] == "--show" for word in rest)
             return [*command.split(), *(["--show", *show.split()] if show and not told else ()), *rest]
     return arguments
-
-
-def _renamed(word: str) -> str:
-    name, equals, value = word.partition("=")
-    return OLD_OPTIONS.get(name, name) + equals + value

@@ -29,7 +29,7 @@ from magtwin.figures.training import draw_correlations
 from magtwin.learn.data.correlation import correlations
 from magtwin.learn.data.features import FEATURES, FULL, features
 from magtwin.learn.evaluation.budget import TERMS, Budget
-from magtwin.learn.evaluation.evaluation import PAPER, Evaluation, Judged
+from magtwin.learn.evaluation.evaluation import PAPER, Evaluation
 from magtwin.learn.evaluation.scores import COVERED, DRAWS, LEVEL
 from magtwin.report.verdict import Z_90
 from magtwin.run.compare import Traversals
@@ -236,7 +236,9 @@ def _rank_correlations(evaluation: Evaluation) -> tuple[Picture, ...]:
 
 def _time_series(evaluation: Evaluation) -> list[Chart]:
     """Figure 5: field as measured and by the map alone, and the errors of each model with their interval."""
-    one = _middle(evaluation)
+    best = _best(evaluation)
+    size = [float(np.mean(np.abs(one.errors().error_nt[best]))) for one in evaluation.judged]
+    one = evaluation.judged[int(np.argsort(size, kind="stable")[(len(size) - 1) // 2])]  # the median
     t = one.run["t"] - one.run["t"][0]
     seen = t <= SHOWN_S
     t, kept = t[seen], one.kept[seen]
@@ -276,13 +278,6 @@ def _time_series(evaluation: Evaluation) -> list[Chart]:
         title = f"Figure 5: errors of {short_name(evaluation.names[m], 40)} on {where}"
         charts.append(Chart(f"{title}: mean size {mae:.0f} nT", errors(m), file=f"figure_5_{m}"))
     return charts
-
-
-def _middle(evaluation: Evaluation) -> Judged:
-    """The recording in which the error of the best model is the median."""
-    best = _best(evaluation)
-    size = [float(np.mean(np.abs(one.errors().error_nt[best]))) for one in evaluation.judged]
-    return evaluation.judged[int(np.argsort(size, kind="stable")[(len(size) - 1) // 2])]
 
 
 @styled

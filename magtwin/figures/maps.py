@@ -172,7 +172,13 @@ def draw_difference(difference: MapDifference) -> Figure:
         reach = max(map(abs, colour_limits(layer, 0))) or 1.0  # all values: the peaks matter here
         cells = draw_cells(ax, grid.x_m, grid.y_m, layer, SIGNED_COLOURS, vmin=-reach, vmax=reach)
         colour_bar(figure, cells, ax, title, below=True)
-        _draw_regions(ax, difference)
+        dx, dy = grid.cell_m
+        for number, region in enumerate(difference.regions[:LISTED], 1):
+            x0, x1, y0, y1 = np.add(region.extent_m, np.array([-dx, dx, -dy, dy]) / 2)
+            ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, ec=INK, lw=1.2))
+            box = {"boxstyle": "round,pad=0.15", "fc": PAPER, "ec": "none", "alpha": 0.8}
+            place: dict[str, Any] = {"textcoords": "offset points", "va": "top"}
+            ax.annotate(str(number), (x0, y1), (2, -2), bbox=box, **place)
     names = [" ".join(t for t in pair if t) for pair in zip(difference.names, difference.days, strict=True)]
     changed, regions = int(difference.changed.any(axis=0).sum()), len(difference.regions)
     words = [
@@ -438,7 +444,10 @@ def _by_heading(
         shown, layers = field.headings_rad[::every], layers[::every]
     else:
         shown = np.asarray(headings, float)
-        layers = _between_headings(field, layers, shown)
+        parts: dict[str, Any] = dict.fromkeys(("variance_nt2", "between_nt2", "harmonic", "recorded_yaw"))
+        values = replace(field, values_nt=layers, valid=np.isfinite(layers), **parts)
+        p_xy = np.stack(np.meshgrid(field.x_m, field.y_m), axis=-1)
+        layers = values.lookup(p_xy[None], shown[:, None, None])  # interpolated as a map is
     if what != "mask" and not np.isfinite(layers).any():
         raise InputError(f"map {field.name!r} has no node whose {what} is known")
     panels = []
@@ -485,26 +494,6 @@ class _Scale:
         drawn.set_rasterized(True)
         ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
         return drawn
-
-
-def _between_headings(field: AnomalyMap, layers: Array, headings: Array) -> Array:
-    """Layers at other headings, interpolated as a map lookup does."""
-    parts: dict[str, Any] = dict.fromkeys(("variance_nt2", "between_nt2", "harmonic", "recorded_yaw"))
-    x, y = np.meshgrid(field.x_m, field.y_m)
-    values = replace(field, values_nt=layers, valid=np.isfinite(layers), **parts)
-    return values.lookup(np.stack([x, y], axis=-1)[None], headings[:, None, None])
-
-
-def _draw_regions(ax: Axes, difference: MapDifference) -> None:
-    """A numbered box around each region that the report lists."""
-    dx, dy = difference.grid.cell_m
-    for number, region in enumerate(difference.regions[:LISTED], 1):
-        x0, x1, y0, y1 = region.extent_m
-        corner = (x0 - dx / 2, y0 - dy / 2)
-        ax.add_patch(Rectangle(corner, x1 - x0 + dx, y1 - y0 + dy, fill=False, ec=INK, lw=1.2))
-        box = {"boxstyle": "round,pad=0.15", "fc": PAPER, "ec": "none", "alpha": 0.8}
-        upper = (x0 - dx / 2, y1 + dy / 2)
-        ax.annotate(str(number), upper, (2, -2), textcoords="offset points", va="top", bbox=box)
 
 
 def _summary(field: AnomalyMap, width: int) -> str:

@@ -105,7 +105,10 @@ def page_of_runs(runs: Sequence[NamedRun], *, advance: Callable[[int], None] = l
         player = player_of(every, first.field, first.stage, still=data)
         title, verdict, lead = _title(first), first.run.report().verdict, _sentence(first.run)
         if len(runs) > 1:
-            verdict = _verdict(every)
+            tally = Tally()
+            for run in every:
+                run.add_to(tally)
+            verdict = tally.verdict(f"the exact field of {len(runs)} robots, one session", holds=HOLDS_ONE)
             title = f"{len(runs)} robots in {first.run.metadata.get('scene', 'a scene')}"
             lead = f"{', '.join(str(run.metadata['robot']) for run in every)} drove together."
         return Page(title, "" if verdict else lead, tuple(sections), player=player, verdict=verdict)
@@ -119,14 +122,6 @@ def together(runs: Sequence[Run]) -> bool:
     facts = {tuple(run.metadata.get(name) for name in ("scene_sha256", "seed", "lab")) for run in runs}
     robots = {run.metadata.get("robot") for run in runs} - {None}
     return len(runs) == 1 or (len(facts) == 1 and len(robots) == len(runs))
-
-
-def _verdict(runs: Sequence[Run]) -> str:
-    """The verdict on the models of several robots; "" without one."""
-    tally = Tally()
-    for run in runs:
-        run.add_to(tally)
-    return tally.verdict(f"the exact field of {len(runs)} robots, one session", holds=HOLDS_ONE)
 
 
 def _title(named: NamedRun) -> str:

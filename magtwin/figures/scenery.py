@@ -162,20 +162,29 @@ class Scenery:
         """
         check_size(size)
         self._times, self._speed, self._view, self._size = np.asarray(times, float), speed, view, size
-        self._position = _position(run)
+        known = (n for n in POSITIONS if n in run and np.isfinite(run[n]).all(axis=1).any())
+        self._position = next(known, "")
+        if not self._position:
+            raise InputError(f"the run has no positions: it has none of {', '.join(POSITIONS)}")
         self._pose(run)
         opened = open_scene(scene_file, check_network=False, lab=str(run.metadata.get("lab", "")))
         stage, scene = opened.stage, opened.scene
         shapes, links = read_shapes(stage), read_links(stage)
         moving = links_of(links, [placed.robot.name for placed in scene.robots], run)
         self._sides = sides_of(scene, run)
-        still = [shape for shape in shapes if shape.link not in moving]
         if not shapes:
             raise InputError(f"{scene_file}: shows nothing")
         self.plotter = plotter_of(size)
         try:
             scale = read_colour_scale(stage)
-            self._build(still, links, [s for s in shapes if s.link in moving], moving, fine, scale)
+            still = [s for s in shapes if s.link not in moving]
+            self._build(still, links, scale, baked=not fine)
+            self._links, self._actors = dict[str, Link](), dict[str, Any]()
+            for name, link in moving.items():
+                own = (s for s in shapes if s.link == name and s.vertex_colours is None)
+                if meshes := [mesh_of(s, s.vertices) for s in own]:
+                    self._links[name] = link
+                    self._actors[name] = self.plotter.add_mesh(joined(meshes), **style_of(False))
             self._build_trail(run, scale)
             light(self.plotter, self._everything, soft=fine)
             if not fine:
@@ -254,29 +263,14 @@ class Scenery:
         self._words = [w + fast for w in words]
 
     def _build(
-        self,
-        still: Sequence[Shape],
-        links: Mapping[str, Link],
-        carried: Sequence[Shape],
-        moving: Mapping[str, Link],
-        fine: bool,
-        scale: ColourScale | None,
+        self, still: Sequence[Shape], links: Mapping[str, Link], scale: ColourScale | None, *, baked: bool
     ) -> None:
-        """Build the lab, one body per look, and each link of the robot."""
+        """Build the lab, one body per look."""
         standing = [placed(s.vertices, links[s.link]) if s.link else s.vertices.astype(float) for s in still]
         self._subjects = [v for s, v in zip(still, standing, strict=True) if is_subject(s, scale)]
-        self._screens, self._walls, self._points = add_still(
-            self.plotter, still, standing, scale, baked=not fine
-        )
+        drawn = add_still(self.plotter, still, standing, scale, baked=baked)
+        self._screens, self._walls, self._points = drawn
         self._things = inside(still, standing)
-        self._actors: dict[str, Any] = {}
-        self._links: dict[str, Link] = {}
-        for name, link in moving.items():
-            meshes = [mesh_of(s, s.vertices) for s in carried if s.link == name and s.vertex_colours is None]
-            if not meshes:
-                continue
-            self._actors[name] = self.plotter.add_mesh(joined(meshes), **style_of(False))
-            self._links[name] = link
         self._everything = np.vstack([*standing, self._p]).astype(float)
 
     def _build_trail(self, run: Run, scale: ColourScale | None) -> None:
@@ -365,14 +359,6 @@ def picture_of_run(
     ):
         write_png(scenery.frame(0), aside)
     return out
-
-
-def _position(run: Run) -> str:
-    """The best position column of a run."""
-    for name in POSITIONS:
-        if name in run and np.isfinite(run[name]).all(axis=1).any():
-            return name
-    raise InputError(f"the run has no positions: it has none of {', '.join(POSITIONS)}")
 
 
 def links_of(links: Mapping[str, Link], robots: Sequence[str], run: Run) -> dict[str, Link]:
