@@ -74,7 +74,10 @@ class Done:
         )
         said = f"{said} {listed(wrote, WIDTH)}" if wrote else ""
         if not any(_mode.values()):
-            told = ": ".join(filter(None, (said, self.text or _inside(wrote))))
+            inside = ""
+            if len(wrote) == 1 and Path(wrote[0]).is_dir():
+                inside = listed(sorted(file.name for file in Path(wrote[0]).glob("[!.]*")))
+            told = ": ".join(filter(None, (said, self.text or inside)))
             tail = [f"{told}; --force replaces" if renamed else told] if told else []
             tail += [f"{'       ' if k else 'Next:  '}{words}" for k, words in enumerate(following)]
             for line in (*self._told(MOST_LINES - len(tail)), *tail):
@@ -128,13 +131,6 @@ def _cut(lines: Sequence[str], most: int, rest: str, left: int = 0) -> list[str]
         *lines[:shown],
         f"and {len(lines) - shown + left:,} more {'facts' if left else 'lines'}: {rest or 'add --json'}",
     ]
-
-
-def _inside(wrote: Sequence[str]) -> str:
-    """What is in the only folder that was written; "" for files."""
-    if len(wrote) != 1 or not Path(wrote[0]).is_dir():
-        return ""
-    return listed(sorted(file.name for file in Path(wrote[0]).glob("[!.]*")))
 
 
 def _bold(text: str) -> str:

@@ -80,7 +80,8 @@ def picture(figure: Figure, title: str, *, alt: str = "", file: str = "", kind: 
     """A figure as a picture for a page. Default of `alt`: the title."""
     figure.set_dpi(PAGE_DPI)
     width, height = figure.get_size_inches()
-    return Picture(title, alt or title, kind, render(figure, f".{kind}"), width / height, file)
+    data = render(figure, f".{kind}")
+    return Picture(title, alt or title, kind, data if kind == "svg" else small(data), width / height, file)
 
 
 @dataclass(frozen=True)

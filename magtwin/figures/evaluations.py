@@ -50,6 +50,15 @@ SHOWN_S = 90.0
 """Length of the part of a run that is shown against time [s]."""
 
 
+LEAD = (
+    "Mean absolute error [nT], with its ratio to that of the naive model in brackets (lower is better). "
+    "The naive model adds the mean training label to the first map. Intervals are "
+    f"{LEVEL:.0%} bootstrap intervals: {DRAWS:,} draws of sessions, runs within them and blocks of time "
+    "within those."
+)
+ONE_SESSION = " With one session only runs and blocks are drawn: the intervals do not cover other sessions."
+
+
 def page_of_evaluation(
     evaluation: Evaluation,
     *,
@@ -76,7 +85,7 @@ def page_of_evaluation(
     pictures += [*_floor_plan(evaluation), *_rank_correlations(evaluation)]
     sections = (
         Section("Errors", "", tuple(pictures)),
-        Section("Table 1", _lead_of_table(evaluation), (), (_table(evaluation),)),
+        Section("Table 1", LEAD + (ONE_SESSION if every.sessions == 1 else ""), (), (_table(evaluation),)),
         *([_budgets(budgets)] if budgets else []),
         *([section_of_traversals(*both)] if both else []),
         Section("Details", "", (), (*(f(evaluation) for f in (_intervals, _models, _maps)), left_out)),
@@ -85,18 +94,6 @@ def page_of_evaluation(
     data |= {"budget": {"models": [budget.summary() for budget in budgets]}} if budgets else {}
     data |= {"traversals": both[0].summary()} if both else {}
     return Page("Evaluation", lead, sections, data=data, verdict="\n".join(verdicts), figures=figures)
-
-
-def _lead_of_table(evaluation: Evaluation) -> str:
-    lead = (
-        "Mean absolute error [nT], with its ratio to that of the naive model in brackets (lower is better). "
-        "The naive model adds the mean training label to the first map. Intervals are "
-        f"{LEVEL:.0%} bootstrap intervals: {DRAWS:,} draws of sessions, runs within them and blocks of time "
-        "within those."
-    )
-    if evaluation.every.sessions == 1:
-        lead += " With one session only runs and blocks are drawn: the intervals do not cover other sessions."
-    return lead
 
 
 def _table(evaluation: Evaluation) -> Table:

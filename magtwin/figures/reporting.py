@@ -7,7 +7,6 @@ from pathlib import Path
 from urllib.parse import quote
 
 from magtwin.errors import InputError, MismatchWarning
-from magtwin.figures.canvas import small
 from magtwin.figures.page import Embedded, Page, Still, to_html, write_page
 from magtwin.figures.player import player_of
 from magtwin.figures.reports import OVERVIEW, NamedRun, overview_of, page_of_runs, together
@@ -90,7 +89,7 @@ def report_scene(scene: Path, out: Source, *, force: bool = False) -> Path:
     except InputError as error:
         warnings.warn(f"{scene}: shown without its map: {error}", MismatchWarning, stacklevel=2)
     still = still_of(None, field)
-    player = player_of([], field, scene, still=b"" if still is None else small(still.data))
+    player = player_of([], field, scene, still=b"" if still is None else still.data)
     if not player.lab:
         raise InputError(f"{scene}: shows nothing")
     page = Page(f"Scene: {scene.stem}", lead, (), player=replace(player, figures=figures))
@@ -133,7 +132,7 @@ def named_run(name: str, run: Run, scene: Source | None, file: Path | None) -> N
 
 def _still(named: NamedRun, link: str) -> Still | None:
     picture = still_of(named.run, named.field)
-    return None if picture is None else Still(replace(picture, data=small(picture.data)), link, named.name)
+    return None if picture is None else Still(picture, link, named.name)
 
 
 def _write_folder(

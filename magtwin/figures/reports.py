@@ -24,7 +24,6 @@ from magtwin.figures.canvas import (
     legend_above,
     new_figure,
     short_name,
-    small,
     stretches,
 )
 from magtwin.figures.maps import FloorPlan, map_charts
@@ -101,7 +100,7 @@ def page_of_runs(runs: Sequence[NamedRun], *, advance: Callable[[int], None] = l
     if together([named.run for named in runs]):
         first, every = runs[0], [named.run for named in runs]
         still = path_picture(first.run, first.field, first.planned)
-        data = b"" if still is None else small(still.data)
+        data = b"" if still is None else still.data
         player = player_of(every, first.field, first.stage, still=data)
         title, verdict, lead = _title(first), first.run.report().verdict, _sentence(first.run)
         if len(runs) > 1:

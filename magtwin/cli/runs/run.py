@@ -137,7 +137,8 @@ def run(
         Show the run in a Rerun viewer, in step with the clock, once it is written. Ctrl-C ends it.
     """
     from magtwin.files.kinds import scene_file
-    from magtwin.io.outputs import Outputs, driven_by
+    from magtwin.io.outputs import Outputs, drive, driven_by
+    from magtwin.run.run import Run
     from magtwin.usd.scene import robots_in
 
     scene = scene_file(scene)
@@ -168,7 +169,16 @@ def run(
     if what is None:
         what = path = str(next(iter(robots.values())) or "figure8")
     step("Opening the scene")
-    driven = _run_one(scene, outputs, what, path, settings, live=live, engine=engine, **options)
+    how, unit = (" in Newton", "steps") if engine == "newton" else ("", "")
+    options["metadata"] = {"replay_file": Path(str(path)).as_posix()} if isinstance(what, Run) else {}
+    with outputs.kept() as keep, outputs.aside() as places:
+        with progress(f"Driving {path}{how}", unit) as advance:
+            options |= {"progress": advance, "each": keep, "report": step, "tell": note}
+            driven = drive(scene, what, engine=engine, **options)
+        step("Writing the run")
+        places.write(driven)
+    if live or settings.viewer:
+        _show(driven, settings.viewer, settings.pace or 1.0)
     made, told = outputs.targets, driven.run.report(f"{path} in {scene.stem}")
     return Done(told, tuple(made), SHOWN, rest=f"magtwin info {made[0]}", next=look_at(made))
 
@@ -225,37 +235,6 @@ def _check(
         from magtwin.io.rerun.live import check_listens
 
         check_listens(settings.viewer)
-
-
-def _run_one(
-    scene: Path,
-    outputs: "Outputs",
-    what: Any,
-    path: str | None,
-    settings: RunSettings,
-    *,
-    live: bool,
-    engine: str,
-    **options: Any,
-) -> "Driven":
-    """Drive the only robot of a scene, show the run if asked for, and write it."""
-    from magtwin.io.outputs import drive
-    from magtwin.run.run import Run
-
-    newton = engine == "newton"
-    replayed = {"replay_file": Path(str(path)).as_posix()} if isinstance(what, Run) else {}
-    with ExitStack() as stack:
-        keep = stack.enter_context(outputs.kept())
-        places = stack.enter_context(outputs.aside())
-        how, unit = (" in Newton", "steps") if newton else ("", "")
-        with progress(f"Driving {path}{how}", unit) as advance:
-            options |= {"progress": advance, "each": keep, "report": step, "metadata": replayed}
-            driven = drive(scene, what, engine=engine, tell=note, **options)
-        step("Writing the run")
-        places.write(driven)
-    if live or settings.viewer:
-        _show(driven, settings.viewer, settings.pace or 1.0)
-    return driven
 
 
 def save_picture(driven: "Driven", out: Path, force: bool) -> None:
