@@ -13,23 +13,18 @@ from cyclopts import Parameter
 from magtwin.errors import InputError, RepairWarning
 
 
-def _whole(kind: type, tokens: Any) -> int:
+def _whole(kind: type, tokens: Any, said: str = "a whole number is wanted,") -> int:
     """A whole number; cyclopts itself would round 1.5 to 2."""
     try:
         return int(tokens[0].value)
     except ValueError:
-        raise ValueError(f"a whole number is wanted, got {tokens[0].value!r}") from None
+        raise ValueError(f"{said} got {tokens[0].value!r}") from None
 
 
 def _session(kind: Any, tokens: Any) -> int | str:
     """A session: its number, or "survey"."""
-    text = tokens[0].value
-    if text == "survey":
-        return "survey"
-    try:
-        return int(text)
-    except ValueError:
-        raise ValueError(f"a session is a whole number, or survey; got {text!r}") from None
+    said = "a session is a whole number, or survey;"
+    return "survey" if tokens[0].value == "survey" else _whole(int, tokens, said)
 
 
 def pairs(

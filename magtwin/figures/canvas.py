@@ -22,7 +22,7 @@ from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.figures.style import FAINT, LIDAR, styled
+from magtwin.figures.style import LIDAR, styled
 from magtwin.files.outputs import output
 from magtwin.report.summary import printable_lines
 from magtwin.run.thinning import newest
@@ -215,11 +215,6 @@ def shade(ax: Axes, t: Array, on: NDArray[np.bool_], *, colour: str = LIDAR, nam
     for k, (first, last) in enumerate(stretches(on)):
         end = t[min(last, len(t) - 1)]
         ax.axvspan(t[first], end, color=colour, lw=0, zorder=-1, label="_" if k else name)
-
-
-def zero_line(ax: Axes) -> None:
-    """A thin line at zero."""
-    ax.axhline(0, color=FAINT, lw=0.7, zorder=0)
 
 
 def thinned(t: Array, values: Array, points: int = POINTS) -> tuple[Array, Array]:

@@ -19,7 +19,6 @@ from magtwin.figures.canvas import (
     new_figure,
     picture,
     short_name,
-    zero_line,
 )
 from magtwin.figures.maps import draw_mean
 from magtwin.figures.page import Page, Section, Table
@@ -258,7 +257,7 @@ def _time_series(evaluation: Evaluation) -> list[Chart]:
             if np.isfinite(half).any():
                 band = {"color": _look(m)["color"], "alpha": 0.2, "lw": 0}
                 ax.fill_between(t[rows], -half, half, label=f"its {COVERED:.0%} interval", **band)
-            zero_line(ax)
+            ax.axhline(0, color=FAINT, lw=0.7, zorder=0)
             finish(ax, "error [nT]")
 
         return draw

@@ -25,7 +25,6 @@ from magtwin.figures.canvas import (
     new_figure,
     picture,
     shade,
-    zero_line,
 )
 from magtwin.figures.maps import EXTEND, FloorPlan, draw_cells, draw_mean, mean_field_nt
 from magtwin.figures.style import (
@@ -130,7 +129,7 @@ class Panel:
             look = {"color": MODEL, "alpha": 0.22, "lw": 0, "label": "its 90 % band", "zorder": 1.9}
             ax.fill_between(t[rows], middle - half, middle + half, **look)
         if self.about_zero:
-            zero_line(ax)
+            ax.axhline(0, color=FAINT, lw=0.7, zorder=0)
         if len(self.curves) > 1 or self.band is not None or self.about_zero:
             legend_above(ax)
         ax.margins(x=0)

@@ -32,7 +32,7 @@ def view(files: Sequence[Source], *, scene: Source | None = None) -> None:
     Raises:
         InputError: A file cannot be read, or there is no viewer.
     """
-    from magtwin.io.rerun.file import show_run
+    from magtwin.io.rerun.file import show_run, write_comparison
     from magtwin.io.rerun.viewer import show
     from magtwin.usd.animation import is_animation
 
@@ -40,7 +40,15 @@ def view(files: Sequence[Source], *, scene: Source | None = None) -> None:
     if not paths:
         raise InputError("name a run or a stage to view")
     if len(paths) > 1:
-        _view_together(paths, scene)
+        alike = len({path.stem for path in paths}) < len(paths)
+        runs = {str(path) if alike else path.stem: read_run(path) for path in paths}
+        if len(runs) < len(paths):
+            raise InputError("one run is named twice; name each once")
+        twin = twin_to_show(next(iter(runs.values())), paths[0], scene)
+        with tempfile.TemporaryDirectory() as folder:
+            rrd = Path(folder) / "runs.rrd"
+            write_comparison(runs, rrd, twin)
+            show(rrd, source=paths[0])
         return
     file, suffix = paths[0], paths[0].suffix.lower()
     is_usd = suffix in USD_SUFFIXES and not file.is_dir()
@@ -114,18 +122,3 @@ def run_and_scene(file: Path, scene: Source | None) -> tuple[Run, Path]:
             f"{stage} has changed since the run; it is drawn as it is now", MismatchWarning, stacklevel=3
         )
     return run, stage
-
-
-def _view_together(files: Sequence[Path], scene: Source | None) -> None:
-    from magtwin.io.rerun.file import write_comparison
-    from magtwin.io.rerun.viewer import show
-
-    alike = len({file.stem for file in files}) < len(files)
-    runs = {str(file) if alike else file.stem: read_run(file) for file in files}
-    if len(runs) < len(files):
-        raise InputError("one run is named twice; name each once")
-    twin = twin_to_show(next(iter(runs.values())), files[0], scene)
-    with tempfile.TemporaryDirectory() as folder:
-        rrd = Path(folder) / "runs.rrd"
-        write_comparison(runs, rrd, twin)
-        show(rrd, source=files[0])
