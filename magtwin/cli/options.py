@@ -67,16 +67,14 @@ def headings_rad(text: str) -> list[float]:
         given = []
     degrees = sorted(set(given))
     if not degrees or any(h != h for h in degrees):
-        raise InputError(
-            f"--headings-deg: headings are degrees with commas between, such as 0,90,180,270; got {text!r}"
-        )
+        form = "headings are degrees with commas between, such as 0,90,180,270"
+        raise InputError(f"--headings-deg: {form}; got {text!r}")
     if len(degrees) > MOST_HEADINGS:
         raise InputError(f"--headings-deg names {len(degrees):,} headings; take {MOST_HEADINGS} at most")
     if len(degrees) < len(given):
         count = f"{len(degrees)} heading{'s' if len(degrees) > 1 else ''}"
-        warnings.warn(
-            f"--headings-deg {text}: {count}, as some are equal (360 is 0)", RepairWarning, stacklevel=2
-        )
+        said = f"--headings-deg {text}: {count}, as some are equal (360 is 0)"
+        warnings.warn(said, RepairWarning, stacklevel=2)
     return [radians(h) for h in degrees]
 
 

@@ -118,7 +118,6 @@ def run_and_scene(file: Path, scene: Source | None) -> tuple[Run, Path]:
     run = read_run(file)
     stage = scene_of(run, scene, near=file)
     if "scene_sha256" in run.metadata and run.metadata["scene_sha256"] != stage_sha256(stage):
-        warnings.warn(
-            f"{stage} has changed since the run; it is drawn as it is now", MismatchWarning, stacklevel=3
-        )
+        text = f"{stage} has changed since the run; it is drawn as it is now"
+        warnings.warn(text, MismatchWarning, stacklevel=3)
     return run, stage
