@@ -254,9 +254,9 @@ def map_survey(
     from magtwin.files.kinds import scene_file
     from magtwin.twin.maps import survey_scene
 
-    given["scene"] = scene_file(scene)
-    given["out"] = out = named(out, (*LAYERS, ".parquet"), READINGS, force=force)
-    given["headings_rad"] = headings_rad(given.pop("headings_deg"))
-    with progress(f"Surveying {given['scene'].name}", "headings") as advance:
-        report = survey_scene(**given, progress=advance)
+    stage = scene_file(given.pop("scene"))
+    out = named(given.pop("out"), (*LAYERS, ".parquet"), READINGS, force=force)
+    angles = headings_rad(given.pop("headings_deg"))
+    with progress(f"Surveying {stage.name}", "headings") as advance:
+        report = survey_scene(stage, out, headings_rad=angles, progress=advance, **given)
     return _done(report, out)

@@ -101,9 +101,9 @@ def robot(
     }
     step("Converting the robot")
     with transaction(), output(report, force=force) if report is not None else nullcontext() as aside:
-        told = {name: choice for name, choice in choices.items() if choice is not None}
+        chosen = {name: choice for name, choice in choices.items() if choice is not None}
         picture = _thumbnail if thumbnail else None
-        made = from_urdf(urdf, out, settings=settings, force=force, thumbnail=picture, **told)
+        made = from_urdf(urdf, out, settings=settings, force=force, thumbnail=picture, **chosen)
         if aside is not None:
             aside.write_text(made.report.to_json(), encoding="utf-8")
     summary = made.report.summary()
