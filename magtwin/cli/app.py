@@ -9,7 +9,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -74,13 +74,8 @@ def main(arguments: list[str], *, tell: Callable[[], str] | None = None) -> None
             if tell is not None:
                 print(tell())  # noqa: T201
             else:
-                app(
-                    arguments,
-                    exit_on_error=False,
-                    print_error=False,
-                    result_action="return_value",
-                    **_help_options(arguments),
-                )
+                how: Any = {"exit_on_error": False, "print_error": False, "result_action": "return_value"}
+                app(arguments, **how, **_help_options(arguments))
             sys.stdout.flush()  # a fault is reported here
     except CycloptsError as error:
         from magtwin.cli.mistakes import explain
@@ -176,12 +171,9 @@ def _no_room(error: Exception) -> str:
     from magtwin.files.outputs import why_full
 
     folder = tempfile.gettempdir()
-    reason = why_full(Path(folder), error)
-    return (
-        f"{folder}: no room for temporary files ({reason}); set TMPDIR to a folder with room"
-        if reason
-        else ""
-    )
+    if reason := why_full(Path(folder), error):
+        return f"{folder}: no room for temporary files ({reason}); set TMPDIR to a folder with room"
+    return ""
 
 
 def _wrong_name(error: Exception, arguments: list[str]) -> str:
@@ -218,19 +210,18 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
     def wrapped(*args: Any, json: bool = False, quiet: bool = False, **options: Any) -> None:
         from magtwin.files.outputs import reading
 
-        how = options.pop("recorded", RECORDED).options if records else {}
+        how = options.pop("recorded", RECORDED).reading() if records else nullcontext()
         _running[:] = [command]
         _read[:] = _files(signature.bind_partial(*args, **options).arguments)
-        with output_mode(as_json=json, quiet=quiet), reading(_read), _recordings(how):
+        with output_mode(as_json=json, quiet=quiet), reading(_read), how:
             done = function(*args, **options)
             if isinstance(done, Done):
                 done.show()
 
     added = {"json": Json, "quiet": Quiet} | ({"recorded": RecordedOptions} if records else {})
-    defaults = {"recorded": RECORDED}
     parameters = list(signature.parameters.values())
     for name in added:
-        default = defaults.get(name, False)
+        default = RECORDED if name == "recorded" else False
         parameters.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default))
     hints = {p.name: _shown(p.name, added.get(p.name, p.annotation)) for p in parameters}
     wrapped.__signature__ = signature.replace(  # type: ignore[attr-defined]
@@ -239,15 +230,6 @@ def _with_output_options(command: App, function: Callable[..., Any]) -> Callable
     wrapped.shares_options = True  # type: ignore[attr-defined]
     wrapped.__annotations__ = {**function.__annotations__, **hints}
     return wrapped
-
-
-def _recordings(options: dict[str, Any]) -> AbstractContextManager[None]:
-    """The options of robots' bags, if any were given."""
-    if not options:
-        return nullcontext()
-    from magtwin.io.formats import recordings
-
-    return recordings(**options)
 
 
 SHORT = {"out": "-o", "force": "-f", "quiet": "-q"}

@@ -2,14 +2,16 @@
 
 import shlex
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Dask, Flag, Force, Jobs, Names, Shard, Whole, pairs
-from magtwin.cli.terminal import Done, continued_by_a_repeat, progress, step
+from magtwin.cli.terminal import Done, continued_by_a_repeat, named, progress, step
 
+ANEW = "Remove all results in the folder first, of all localizers."
+Anew = Annotated[bool, Parameter(name="--force", negative="", help=ANEW)]
 Results = Annotated[Path, Parameter(required=True)]
 
 bench_app = App(name="bench")
@@ -30,12 +32,7 @@ def bench(
     shard: Shard = None,
     dask: Dask = None,
     no_tracks: Flag = False,
-    force: Annotated[
-        bool,
-        Parameter(
-            name="--force", negative="", help="Remove all results in the folder first, of all localizers."
-        ),
-    ] = False,
+    force: Anew = False,
 ) -> Done:
     """Benchmark localizers on simulated and recorded drives, and report the results.
 
@@ -71,22 +68,11 @@ def bench(
     from magtwin.bench.runner import benchmark
     from magtwin.parallel import parse_shard
 
+    what: Any = {"scenarios": only or (), "localizers": localizer or (), "runs": runs, "seeds": seeds}
     with continued_by_a_repeat(), progress(f"Benchmarking {suite}", "runs") as advance:
-        made = benchmark(
-            suite,
-            out,
-            scenarios=only or (),
-            localizers=localizer or (),
-            runs=runs,
-            seeds=seeds,
-            data=pairs("data", data, "NAME=FOLDER"),
-            jobs=jobs,
-            shard=None if shard is None else parse_shard(shard),
-            dask=dask,
-            tracks=not no_tracks,
-            force=force,
-            progress=advance,
-        )
+        what |= {"data": pairs("data", data, "NAME=FOLDER"), "tracks": not no_tracks, "force": force}
+        how: Any = {"jobs": jobs, "dask": dask, "shard": None if shard is None else parse_shard(shard)}
+        made = benchmark(suite, out, progress=advance, **what, **how)
     report = made.report(standings(made.rows, made.times, made.compensated))
     page = ("magtwin", "bench", "report", out)
     return Done(report, out, rest=shlex.join(map(str, page)), next=(page,))
@@ -106,9 +92,8 @@ def report(*folders: Results, out: Path | None = None, force: Force = False) -> 
         Folder to make. Default: `report` in the first folder.
     """
     from magtwin.bench.report import report_results
-    from magtwin.files.outputs import free
 
-    (made,) = free(folders[0] / "report" if out is None else out, force=force)
+    made = named(folders[0] / "report" if out is None else out, force=force)
     step("Reading the results")
     report_results(folders, made, force=force)
     return Done(wrote=(made / "bench.html", made / "bench.json"), text="open bench.html in a browser")

@@ -36,17 +36,15 @@ def doctor() -> Done:
     extras = found["extras"]
     missing = {name: extra for name, extra in extras.items() if not extra["installed"]}
     others = [f"{name}: {text}" for name, text in found["tools"].items() if text.startswith("not found; ")]
-    versions = ", ".join(f"{name} {version}" for name, version in found["packages"].items())
     lines = [
         f"magtwin {found['magtwin']}, Python {found['python']}: "
         f"{len(extras) - len(missing)} of {len(extras)} extras are installed",
-        versions,
+        ", ".join(f"{name} {version}" for name, version in found["packages"].items()),
         *(f"missing  {name}: {extra['adds']}; {extra['install']}" for name, extra in missing.items()),
         *(f"missing  {text.replace('not found; ', '')}" for text in others if "magtwin[" not in text),
     ]
-    return Done(
-        lines=lines, data=found | {"tools": {key(name): text for name, text in found["tools"].items()}}
-    )
+    tools = {key(name): text for name, text in found["tools"].items()}
+    return Done(lines=lines, data=found | {"tools": tools})
 
 
 def diagnose() -> dict[str, Any]:
@@ -64,6 +62,14 @@ def diagnose() -> dict[str, Any]:
         ("NVIDIA validator", _version("usd-validation-nvidia"), "pip install 'magtwin[validate]'"),
         ("SimReady validator", _version("simready-validate"), "make simready, in a checkout"),
     )
+    extras = {
+        name: {
+            "installed": bool(_version(package)),
+            "adds": adds,
+            "install": f"pip install 'magtwin[{name}]'",
+        }
+        for name, (package, adds) in ADDS.items()
+    }
     from magtwin.version import __version__
 
     return {
@@ -71,19 +77,7 @@ def diagnose() -> dict[str, Any]:
         "python": sys.version.split()[0],
         "packages": {name: _version(name) or "not installed" for name in PACKAGES},
         "tools": {name: found or f"not found; {remedy}" for name, found, remedy in tools},
-        "extras": _extras(),
-    }
-
-
-def _extras() -> dict[str, dict[str, Any]]:
-    """Each extra: whether it is installed, what it adds and how to install it."""
-    return {
-        name: {
-            "installed": bool(_version(package)),
-            "adds": adds,
-            "install": f"pip install 'magtwin[{name}]'",
-        }
-        for name, (package, adds) in ADDS.items()
+        "extras": extras,
     }
 
 

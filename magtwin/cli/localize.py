@@ -6,21 +6,21 @@ from pathlib import Path
 from typing import Any
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Names, Seed, pairs, reads_recordings
+from magtwin.cli.options import AnyRun, Folder, Force, Names, Seed, pairs, reads_recordings
 from magtwin.cli.ros import HERE, FramePrefix, WallS, Where, ros_app, spin
-from magtwin.cli.terminal import Done, announce, progress, step
+from magtwin.cli.terminal import Done, announce, named, progress, step
 from magtwin.errors import InputError, hint
 
 
 @app.command
 @reads_recordings
 def localize(
-    run: Path,
+    run: AnyRun,
     *,
     map: str,  # noqa: A002 - the option is called --map
     method: str = "rbpf-iron",
     option: Names = None,
-    out: Path = Path("localized"),
+    out: Folder = Path("localized"),
     prior: str = "tracking",
     rate_hz: float = 5.0,
     sensor: Names = None,
@@ -40,8 +40,6 @@ def localize(
 
     Parameters
     ----------
-    run
-        A run in any format that magtwin reads.
     map
         Map layer, stage, folder of survey CSVs, or the name of a scene that ships with magtwin (lab). none:
         no map, for the methods of simultaneous localization and mapping, such as incremental-slam.
@@ -50,8 +48,6 @@ def localize(
         folder or an installed package.
     option
         Options of the method, as NAME=VALUE.
-    out
-        Folder to make.
     prior
         Start that the method is told: tracking (the true pose with errors of 0.1 m and 5 deg), heading (the
         heading within 10 deg; no position), global (nothing), or a pose x,y,yaw [m, m, rad]. For a negative
@@ -74,7 +70,6 @@ def localize(
         Earlier run of the same session, with true poses.
     """
     from magtwin.figures.localization import save_localization
-    from magtwin.files.outputs import free
     from magtwin.io.formats import read_run
     from magtwin.localization.problem import OdometryModel, SensorModel
     from magtwin.tasks.localizing import ROBOT_NOISE, lever_arm_of, localization
@@ -82,24 +77,17 @@ def localize(
     step(f"Reading {run}")
     whole = read_run(run)
     told = _values("sensor", sensor, SensorModel)
-    (out,) = free(out, force=force)
+    out = named(out, force=force)
     with progress("Localizing", "readings") as advance:
-        result = localization(
-            whole,
-            None if map == "none" else map,
-            method=method,
-            options=_values("option", option),
-            prior=prior,
-            sensor=replace(ROBOT_NOISE, **{"lever_arm_m": lever_arm_of(whole), **told}),
-            odometry=OdometryModel(**_values("odometry", odometry, OdometryModel)),
-            map_length_m=map_length_m,
-            compensator=compensator,
-            calibration=calibration,
-            rate_hz=rate_hz,
-            seed=seed,
-            keep_particles=True,
-            progress=advance,
-        )
+        noise: Any = {
+            "sensor": replace(ROBOT_NOISE, **{"lever_arm_m": lever_arm_of(whole), **told}),
+            "odometry": OdometryModel(**_values("odometry", odometry, OdometryModel)),
+            "map_length_m": map_length_m,
+        }
+        how: Any = {"method": method, "options": _values("option", option), "prior": prior, "seed": seed}
+        how |= {"compensator": compensator, "calibration": calibration, "rate_hz": rate_hz}
+        on = None if map == "none" else map
+        result = localization(whole, on, keep_particles=True, progress=advance, **noise, **how)
     step("Writing the estimate")
     save_localization(result, out, force=force)
     errors = ("position error, RMSE", "heading error, RMSE", "dead reckoning, RMSE")

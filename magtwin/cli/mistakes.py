@@ -35,8 +35,8 @@ def explain(error: CycloptsError) -> str:
     if type(error) is MissingArgumentError and arguments is not None:
         return _missing(command, arguments, error.keyword, app)
     if isinstance(error, UnusedCliTokensError) and error.unused_tokens:
-        example = "; for example: magtwin ".join(("", *examples(command)[:1]))
-        return f"magtwin {command} cannot use {error.unused_tokens[0]!r}, which is one too many{example}"
+        much = f"{error.unused_tokens[0]!r}, which is one too many"
+        return f"magtwin {command} cannot use {much}{_example(command)}"
     text, file = str(error), getattr(getattr(error, "token", None), "source", "")
     return f"{file}: {text}" if Path(file).is_absolute() and file not in text else text
 
@@ -84,18 +84,16 @@ def _unknown_option(command: str, typed: str, arguments: ArgumentCollection) -> 
 
 def _missing(command: str, argument: Argument, typed: str | None, app: App | None) -> str:
     """What is said of an argument or a value that is needed."""
-    told = next(
-        (
-            first_sentence(str(each.parameter.help)).rstrip(".")
-            for each in (app.assemble_argument_collection(parse_docstring=True) if app else ())
-            if each.name == argument.name and each.parameter.help
-        ),
-        "",
-    )
+    known = app.assemble_argument_collection(parse_docstring=True) if app else ()
+    helps = (each.parameter.help for each in known if each.name == argument.name)
+    told = next((first_sentence(str(text)).rstrip(".") for text in helps if text), "")
     flag = typed or next((token.keyword for token in argument.tokens if token.keyword), None)
     if flag:
         return f"{flag} wants a value: {told}"
     positional = argument.field_info.is_positional
     name = argument.name.strip("-").upper() if positional else argument.name
-    example = "; for example: magtwin ".join(("", *examples(command)[:1]))
-    return f"magtwin {command} needs {name}: {told}{example}"
+    return f"magtwin {command} needs {name}: {told}{_example(command)}"
+
+
+def _example(command: str) -> str:
+    return "; for example: magtwin ".join(("", *examples(command)[:1]))

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from math import radians
 from pathlib import Path
@@ -12,23 +13,18 @@ from cyclopts import Parameter
 from magtwin.errors import InputError, RepairWarning
 
 
-def _whole(kind: type, tokens: Any) -> int:
+def _whole(kind: type, tokens: Any, said: str = "a whole number is wanted,") -> int:
     """A whole number; cyclopts itself would round 1.5 to 2."""
     try:
         return int(tokens[0].value)
     except ValueError:
-        raise ValueError(f"a whole number is wanted, got {tokens[0].value!r}") from None
+        raise ValueError(f"{said} got {tokens[0].value!r}") from None
 
 
 def _session(kind: Any, tokens: Any) -> int | str:
     """A session: its number, or "survey"."""
-    text = tokens[0].value
-    if text == "survey":
-        return "survey"
-    try:
-        return int(text)
-    except ValueError:
-        raise ValueError(f"a session is a whole number, or survey; got {text!r}") from None
+    said = "a session is a whole number, or survey;"
+    return "survey" if tokens[0].value == "survey" else _whole(int, tokens, said)
 
 
 def pairs(
@@ -71,19 +67,19 @@ def headings_rad(text: str) -> list[float]:
         given = []
     degrees = sorted(set(given))
     if not degrees or any(h != h for h in degrees):
-        raise InputError(
-            f"--headings-deg: headings are degrees with commas between, such as 0,90,180,270; got {text!r}"
-        )
+        form = "headings are degrees with commas between, such as 0,90,180,270"
+        raise InputError(f"--headings-deg: {form}; got {text!r}")
     if len(degrees) > MOST_HEADINGS:
         raise InputError(f"--headings-deg names {len(degrees):,} headings; take {MOST_HEADINGS} at most")
     if len(degrees) < len(given):
         count = f"{len(degrees)} heading{'s' if len(degrees) > 1 else ''}"
-        warnings.warn(
-            f"--headings-deg {text}: {count}, as some are equal (360 is 0)", RepairWarning, stacklevel=2
-        )
+        said = f"--headings-deg {text}: {count}, as some are equal (360 is 0)"
+        warnings.warn(said, RepairWarning, stacklevel=2)
     return [radians(h) for h in degrees]
 
 
+Folder = Annotated[Path, Parameter(help="Folder to make.")]
+AnyRun = Annotated[Path, Parameter(help="A run in any format that magtwin reads.")]
 Whole = Annotated[int, Parameter(converter=_whole)]
 Flag = Annotated[bool, Parameter(negative="")]
 Names = Annotated[list[str] | None, Parameter(consume_multiple=True)]
@@ -233,6 +229,14 @@ class Recorded:
         topics = pairs("remap", self.remap, OURS_THEIRS) | {n: t for n, t in chosen.items() if t}
         given = {"topics": topics or None, "unit": self.unit, "scale": self.scale}
         return {name: value for name, value in given.items() if value is not None}
+
+    def reading(self) -> AbstractContextManager[None]:
+        """Until its end, these options hold for all robots' bags, if any were given."""
+        if not self.options:
+            return nullcontext()
+        from magtwin.io.formats import recordings
+
+        return recordings(**self.options)
 
 
 RecordedOptions = Annotated[Recorded, Parameter(name="*")]

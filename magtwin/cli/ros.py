@@ -12,6 +12,7 @@ from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import (
+    AnyRun,
     Flag,
     Force,
     Lab,
@@ -28,12 +29,11 @@ from magtwin.cli.options import (
     check_pace,
     reads_recordings,
 )
-from magtwin.cli.terminal import Done, announce, progress, silence, step
+from magtwin.cli.terminal import Done, announce, named, progress, silence, step
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
     from magtwin.ros.bus import Bus
-    from magtwin.spec.drive import DriveSpec
 
 ros_app = App(name="ros", help="Run the twin and its sensors as ROS 2 nodes.")
 app.command(ros_app)
@@ -77,12 +77,17 @@ class Node:
             raise InputError(f"--duration-s is at most {LONGEST_S:g} s; leave it out to go on until Ctrl-C")
         from magtwin.compiled import steady
         from magtwin.ros.bus import names_of, open_bus
+        from magtwin.ros.bus.names import interfaces
 
         space = ("" if several else "robot") if self.namespace is None else self.namespace
         place: Any = {"backend": self.backend, "domain": self.domain, "discovery": self.discovery}
         names = names_of(space, self.remap)
         bus = open_bus(self.node_name or name, names=names, sim_time=sim_time, **place)
-        _announce_reach(bus)
+        if bus.reach == "subnet":
+            hosts = ", ".join(interfaces()) or "none"
+            _warn(f"every host on the network can find this node and send to it (interfaces: {hosts})")
+        else:
+            announce("only this machine can find this node; --discovery subnet opens it to the network")
         signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a script ignore it
         try:
             with suppress(KeyboardInterrupt), steady():
@@ -263,11 +268,13 @@ def follow(
     continuous
         Drive until Ctrl-C.
     """
+    from magtwin.files.file import shipped
     from magtwin.path import resolve_path
     from magtwin.ros.follow import Follower
+    from magtwin.usd.robot import load_robot
 
     way = resolve_path(path)
-    drive = _drive_of(asset)
+    drive = load_robot(asset or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive
     with where.bus("magtwin_follow", sim_time=sim_time) as bus:
         options: Any = {"speed": speed, "controller": controller, "source": source, "laps": laps}
         options |= {"continuous": continuous, "commands": commands, "stamps": stamps, "say": announce}
@@ -308,11 +315,10 @@ def record(
     topic
         Topic to record beside those of the robot, such as /scan_2. May be repeated.
     """
-    from magtwin.files.outputs import free
     from magtwin.io.bags import RawBagWriter
     from magtwin.ros.record import Recorder
 
-    (out,) = free(out, force=force)
+    out = named(out, force=force)
     writer = RawBagWriter(out, force=force)
     try:
         with where.bus("magtwin_record", sim_time=sim_time, duration_s=duration_s) as bus:
@@ -337,7 +343,7 @@ def record(
 @ros_app.command(name="replay")
 @reads_recordings
 def replay(
-    run: Path,
+    run: AnyRun,
     *,
     topic: tuple[str, ...] = (),
     scene: Path | None = None,
@@ -352,8 +358,6 @@ def replay(
 
     Parameters
     ----------
-    run
-        A run in any format that magtwin reads.
     topic
         Topic to publish. May be repeated. Default: all.
     scene
@@ -389,25 +393,6 @@ def spin(bus: "Bus", duration_s: float | None) -> None:
             bus.spin_once(0.1)
             if duration_s is not None:
                 advance(gone, duration_s)
-
-
-def _announce_reach(bus: "Bus") -> None:
-    """Which machines reach the node."""
-    from magtwin.ros.bus.names import interfaces
-
-    if bus.reach == "subnet":
-        names = ", ".join(interfaces()) or "none"
-        _warn(f"every host on the network can find this node and send to it (interfaces: {names})")
-    else:
-        announce("only this machine can find this node; --discovery subnet opens it to the network")
-
-
-def _drive_of(asset: Path | None) -> "DriveSpec":
-    """Limits of a robot's drive."""
-    from magtwin.files.file import shipped
-    from magtwin.usd.robot import load_robot
-
-    return load_robot(asset or shipped("robots", "turtlebot4", "turtlebot4.usda")).drive
 
 
 def _warn(text: str) -> None:

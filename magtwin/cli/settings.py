@@ -66,11 +66,9 @@ def is_setting(argument: Argument) -> bool:
 def setting_text(typed: str, commands: tuple[str, ...], name: str = "") -> str:
     """How the setting of a command is set, that was typed as an option; `name` is its own."""
     key = (name or typed).removeprefix("--").replace("-", "_")
-    variable = _in_capitals("_".join((*commands, key)))
-    table = " ".join(commands)
-    return (
-        f"{typed} is a setting: put `{key} = ...` below [{table}] in magtwin.toml, or set MAGTWIN_{variable}"
-    )
+    variable = f"MAGTWIN_{_in_capitals('_'.join((*commands, key)))}"
+    place = f"below [{' '.join(commands)}] in magtwin.toml"
+    return f"{typed} is a setting: put `{key} = ...` {place}, or set {variable}"
 
 
 class Settings(Toml):
@@ -92,9 +90,8 @@ class Environment(Env):
         """Refuse flags of settings, and add the options in the environment to those of the command line."""
         for argument in arguments:
             if is_setting(argument) and argument.tokens:
-                raise CycloptsError(
-                    msg=setting_text(str(argument.tokens[0].keyword), commands, argument.name)
-                )
+                typed = str(argument.tokens[0].keyword)
+                raise CycloptsError(msg=setting_text(typed, commands, argument.name))
         super().__call__(app, commands, arguments)
         if not commands:
             return

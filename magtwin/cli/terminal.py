@@ -73,15 +73,18 @@ class Done:
             f"{' and '.join(renamed)} exist{'s' if len(renamed) == 1 else ''}: wrote" if renamed else "Wrote"
         )
         said = f"{said} {listed(wrote, WIDTH)}" if wrote else ""
-        if not (_mode.json or _mode.quiet):
-            told = ": ".join(filter(None, (said, self.text or _inside(wrote))))
+        if not any(_mode.values()):
+            inside = ""
+            if len(wrote) == 1 and Path(wrote[0]).is_dir():
+                inside = listed(sorted(file.name for file in Path(wrote[0]).glob("[!.]*")))
+            told = ": ".join(filter(None, (said, self.text or inside)))
             tail = [f"{told}; --force replaces" if renamed else told] if told else []
             tail += [f"{'       ' if k else 'Next:  '}{words}" for k, words in enumerate(following)]
             for line in (*self._told(MOST_LINES - len(tail)), *tail):
                 say(line)
         elif renamed:
             print_error(said)
-        if _mode.json:
+        if _mode["json"]:
             data = self.data
             if data is None:
                 data = {} if self.report is None else json.loads(self.report.to_json())
@@ -100,7 +103,11 @@ class Done:
         flags = [figure for figure in report.figures if FLAG in figure.name]
         lines = [_bold(report.title), *([_bold(report.verdict)] if report.verdict else [])]
         if self.whole:
-            return [*lines, *_rows(report.figures), *_facts(report.metadata)]
+            words = [
+                (name, str(each)) for name, each in report.metadata.items() if not isinstance(each, LISTS)
+            ]
+            lists = [line for name, each in report.metadata.items() for line in _notes(name, each)]
+            return [*lines, *_rows(report.figures), *aligned([row for row in words if row[1]]), *lists]
         chosen = [named[name] for name in self.figures if name in named]
         if not self.figures:
             chosen = [figure for figure in report.figures if figure not in flags]
@@ -124,13 +131,6 @@ def _cut(lines: Sequence[str], most: int, rest: str, left: int = 0) -> list[str]
         *lines[:shown],
         f"and {len(lines) - shown + left:,} more {'facts' if left else 'lines'}: {rest or 'add --json'}",
     ]
-
-
-def _inside(wrote: Sequence[str]) -> str:
-    """What is in the only folder that was written; "" for files."""
-    if len(wrote) != 1 or not Path(wrote[0]).is_dir():
-        return ""
-    return listed(sorted(file.name for file in Path(wrote[0]).glob("[!.]*")))
 
 
 def _bold(text: str) -> str:
@@ -157,13 +157,6 @@ def _rows(figures: Sequence[Any], *, clip: bool = False) -> list[str]:
         numbers.append((figure.name, shown, f"{spread}{figure.unit}", figure.note))
     lines = [*aligned(numbers, right=(1,)), *aligned(words)]
     return [clipped(line, columns) if clip and columns else line for line in lines]
-
-
-def _facts(metadata: dict[str, Any]) -> list[str]:
-    """All metadata: words by name, and then lists."""
-    words = [(name, str(each)) for name, each in metadata.items() if not isinstance(each, LISTS)]
-    lists = [line for name, each in metadata.items() for line in _notes(name, each)]
-    return [*aligned([row for row in words if row[1]]), *lists]
 
 
 def _notes(name: str, entry: Any, *, brief: bool = False) -> list[str]:
@@ -194,40 +187,33 @@ def print_json(data: Any) -> None:
     print("".join(c if c.isprintable() or c == "\n" else json.dumps(c)[1:-1] for c in text))  # noqa: T201
 
 
-@dataclass
-class _Mode:
-    """What --json and --quiet of the command said."""
-
-    json: bool = False
-    quiet: bool = False
-
-
-_mode = _Mode()
+_mode = {"json": False, "quiet": False}
+"""What --json and --quiet of the command said."""
 
 
 @contextmanager
 def output_mode(*, as_json: bool, quiet: bool) -> Iterator[None]:
     """Print JSON, or nothing, until the end of the block."""
-    before = _mode.json, _mode.quiet
-    _mode.json, _mode.quiet = as_json, quiet
+    before = dict(_mode)
+    _mode.update(json=as_json, quiet=quiet)
     watch = current()
     watch.announces, watch.mute = not as_json, quiet
     try:
         yield
     finally:
-        _mode.json, _mode.quiet = before
+        _mode.update(before)
 
 
 def say(text: str) -> None:
     """Print a line on stdout; nothing with --json or --quiet."""
-    if not (_mode.json or _mode.quiet):
+    if not any(_mode.values()):
         current().clear()
         print(printable_lines(text))  # noqa: T201
 
 
 def note(text: str) -> None:
     """Print an indented line on stderr; nothing with --quiet."""
-    if not _mode.quiet:
+    if not _mode["quiet"]:
         current().clear()
         print(f"  {printable_lines(text)}", file=sys.stderr)  # noqa: T201
 
@@ -275,19 +261,14 @@ class _Trimmed(io.TextIOBase):
         sys.stdout.flush()
 
 
-def check_suffix(path: Path, suffixes: tuple[str, ...], what: str) -> None:
-    """Refuse an output whose name has another suffix."""
-    if path.suffix.lower() not in suffixes:
-        raise InputError(f"{path}: {what} ends in {' or '.join(suffixes)}")
-
-
 def named(
-    path: Path, suffixes: tuple[str, ...], what: str, *, beside: Sequence[str] = (), force: bool
+    path: Path, suffixes: Sequence[str] = (), what: str = "", *, beside: Sequence[str] = (), force: bool
 ) -> Path:
-    """A free name for an output of one of the suffixes: `magtwin.files.outputs.free`."""
+    """A free name for an output, of one of the suffixes if there are any: `magtwin.files.outputs.free`."""
     from magtwin.files.outputs import free
 
-    check_suffix(path, suffixes, what)
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise InputError(f"{path}: {what} ends in {' or '.join(suffixes)}")
     return free(path, beside=beside, force=force)[0]
 
 

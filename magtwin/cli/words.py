@@ -88,10 +88,8 @@ def _vocabulary() -> tuple[dict[str, dict[str, float]], dict[str, list[frozenset
                 if part == word:
                     weight *= 1.0 if word in groups else LESS.get(stem(word), 1.0)
                     known[command] = max(known.get(command, 0.0), weight)
-        pairs = (
-            *(word.split("-") for word in text.split() if "-" in word),
-            *([command.split()] if groups else ()),
-        )
+        pairs = [word.split("-") for word in text.split() if "-" in word]
+        pairs += [command.split()] if groups else []
         together[command] = [frozenset(map(stem, pair)) for pair in pairs]
     return single, together
 
@@ -141,12 +139,10 @@ def as_of_today(arguments: list[str]) -> list[str]:
     for count in (2, 1):
         if new := OLD.get(" ".join(arguments[:count])):
             command, _, show = new.partition(" --show")
-            rest = [_renamed(word) if command == "plot" else word for word in arguments[count:]]
+            rest = arguments[count:]
+            if command == "plot":
+                parts = [word.partition("=") for word in rest]
+                rest = [OLD_OPTIONS.get(name, name) + equals + value for name, equals, value in parts]
             told = any(word.partition("=")[0] == "--show" for word in rest)
             return [*command.split(), *(["--show", *show.split()] if show and not told else ()), *rest]
     return arguments
-
-
-def _renamed(word: str) -> str:
-    name, equals, value = word.partition("=")
-    return OLD_OPTIONS.get(name, name) + equals + value

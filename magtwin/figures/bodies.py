@@ -34,21 +34,16 @@ MAP_PRIM = "/AnomalyMap"
 def bodies_of(arrays: dict[str, Array], stage: Path, runs: Sequence[Run]) -> tuple[list[dict[str, Any]], int]:
     """The bodies of a scene, and the number of shapes that are left out.
 
-    Adds the points of each body to `arrays`, in 1/65535 of its box, its faces and colours.
-
-    Args:
-        arrays: Arrays of the page by name.
-        stage: The scene.
-        runs: The robots that move, in the order of the page. None move without a run.
+    Adds the points of each body to `arrays`, in 1/65535 of its box, its faces and colours. The robots of the
+    runs move, in the order of the page.
 
     Returns:
         Boxes of the bodies; whether it is part of a robot, `solid`; the number of its robot if a body moves;
         and side, pose and axis of a wheel.
     """
     try:
-        opened = open_scene(
-            stage, check_network=False, lab=str(runs[0].metadata.get("lab", "")) if runs else ""
-        )
+        lab = str(runs[0].metadata.get("lab", "")) if runs else ""
+        opened = open_scene(stage, check_network=False, lab=lab)
         shown, scene = opened.stage, opened.scene
     except InputError:
         if runs:
@@ -90,9 +85,8 @@ def _body_of(
 ) -> tuple[str, dict[str, Any]]:
     """Name of the body that a shape is a part of, and what is known of the body."""
     if shape.link not in robots:
-        robot = shape.link and any(
-            link.joint and link.base == links[shape.link].base for link in links.values()
-        )
+        bases = {link.base for link in links.values() if link.joint}
+        robot = shape.link and links[shape.link].base in bases
         return ("standing", {"name": "standing", "solid": 1}) if robot else ("lab", {"name": "lab"})
     link, k = links[shape.link], robots[shape.link]
     if link.joint in sides[k] and link.rolling_axis is not None:

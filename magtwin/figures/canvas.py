@@ -17,13 +17,12 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.figures.style import FAINT, LIDAR, PAPER, styled
+from magtwin.figures.style import LIDAR, styled
 from magtwin.files.outputs import output
 from magtwin.report.summary import printable_lines
 from magtwin.run.thinning import newest
@@ -81,7 +80,8 @@ def picture(figure: Figure, title: str, *, alt: str = "", file: str = "", kind: 
     """A figure as a picture for a page. Default of `alt`: the title."""
     figure.set_dpi(PAGE_DPI)
     width, height = figure.get_size_inches()
-    return Picture(title, alt or title, kind, render(figure, f".{kind}"), width / height, file)
+    data = render(figure, f".{kind}")
+    return Picture(title, alt or title, kind, data if kind == "svg" else small(data), width / height, file)
 
 
 @dataclass(frozen=True)
@@ -169,11 +169,6 @@ def legend_above(ax: Axes, columns: int = 4, **options: Any) -> None:
         ax.legend(ncols=columns, loc="lower left", bbox_to_anchor=(0, 1), **options)
 
 
-def legend_below(figure: Figure, *entries: Any, columns: int = 2) -> None:
-    """A legend below the whole figure."""
-    figure.legend(*entries, loc="outside lower center", ncols=columns)
-
-
 def colour_bar(figure: Any, drawn: ScalarMappable, axes: Any, title: str, **options: Any) -> None:
     """A colour bar with a title, to the right or, with `below`, under the axes."""
     flat = {"orientation": "horizontal", "aspect": 36, "ticks": MaxNLocator(4)}
@@ -196,58 +191,34 @@ def draw_line(ax: Axes, t: Array, values: Array, **look: Any) -> None:
 def coloured_line(
     ax: Axes, points: Array, values: Array, limits: tuple[float, float], colours: str, width: float
 ) -> LineCollection:
-    """Draw a line coloured by the values at its points; segments beside an unknown value are left out.
+    """Draw a line through finite points (N, 2) coloured by the values (N,) at them, of a width in points.
 
-    Args:
-        ax: Where to draw.
-        points: Shape (N, 2), finite.
-        values: Shape (N,).
-        limits: Values at the ends of the colour scale.
-        colours: Name of the colour scale.
-        width: Width of the line [points].
+    Segments beside an unknown value are left out. `limits` are the values at the ends of the colour scale.
     """
     rows = newest(evenly(len(points), SEGMENTS + 1), np.isfinite(values))
     points, values = points[rows], values[rows]
-    line = LineCollection(
-        list(np.stack([points[:-1], points[1:]], axis=1)),
-        array=np.ma.masked_invalid((values[:-1] + values[1:]) / 2),
-        cmap=colours,
-        clim=limits,
-        lw=width,
-        capstyle="round",
-        zorder=3,
-        rasterized=True,
-    )
+    middle = np.ma.masked_invalid((values[:-1] + values[1:]) / 2)
+    look: dict[str, Any] = {"lw": width, "capstyle": "round", "zorder": 3, "rasterized": True}
+    segments = list(np.stack([points[:-1], points[1:]], axis=1))
+    line = LineCollection(segments, array=middle, cmap=colours, clim=limits, **look)
     ax.add_collection(line)
     return line
 
 
+def stretches(on: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """First index and the one after the last of each stretch in which a flag is set, shape (K, 2)."""
+    return np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int))).reshape(-1, 2)
+
+
 def shade(ax: Axes, t: Array, on: NDArray[np.bool_], *, colour: str = LIDAR, name: str = "_") -> None:
     """Shade the spans of time in which a flag is set, the first of them with a name for the legend."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int)))
-    for k, (first, last) in enumerate(edges.reshape(-1, 2)):
+    for k, (first, last) in enumerate(stretches(on)):
         end = t[min(last, len(t) - 1)]
         ax.axvspan(t[first], end, color=colour, lw=0, zorder=-1, label="_" if k else name)
 
 
-def halo(width: float = 1.6) -> dict[str, Any]:
-    """The look of a line over a map: a rim in the colour of the paper."""
-    return {"path_effects": [withStroke(linewidth=2 * width, foreground=PAPER)]}
-
-
-def zero_line(ax: Axes) -> None:
-    """A thin line at zero."""
-    ax.axhline(0, color=FAINT, lw=0.7, zorder=0)
-
-
 def thinned(t: Array, values: Array, points: int = POINTS) -> tuple[Array, Array]:
-    """A line of fewer points that looks the same: the least and the greatest value of each stretch.
-
-    Args:
-        t: Ascending positions of the values, shape (N,).
-        values: Shape (N,); values that are not finite make gaps.
-        points: Approximate number of points to keep.
-    """
+    """A line (N,) of about as many points that looks the same: the least and greatest of each stretch."""
     size = max(1, 2 * len(t) // points)
     if size == 1:
         return t, values
@@ -266,9 +237,3 @@ def short_name(name: str, most: int = LONGEST_NAME) -> str:
     """A name of at most `most` characters; a long one loses its middle."""
     half = (most - 1) // 2
     return name if len(name) <= most else f"{name[:half]}…{name[-half:]}"
-
-
-def short_pair(names: tuple[str, str]) -> tuple[str, str]:
-    """Short names of two runs, which always differ."""
-    a, b = (short_name(name) for name in names)
-    return (a, b) if a != b else (f"A: {a}", f"B: {b}")

@@ -46,11 +46,9 @@ def draw(
 
     Args:
         files: One file, or two of one kind. Names of shipped scenes are stages.
-        out: File to write; its suffix says whether it is a picture or a film. None: a PNG in the working
-            folder, named after the first file.
-        show: What to draw of a run (charts, picture) or of a map and the map of a stage. None: charts of a
-            run unless `at_s` or `camera` asks for a picture; a recording as the Rerun viewer shows it; mean,
-            heading effect, standard deviation and gradient of a map; a stage as it looks.
+        out: Picture or film, by its suffix. None: a PNG in the working folder, named after the first file.
+        show: What to draw of a run, or of a map, a stage's too. None: charts of a run unless `at_s` or
+            `camera` asks for a picture; a recording as its viewer shows it; a map's overview; a stage.
         force: Whether an existing output is replaced.
         advance: Called with the frames of a film that are drawn, and their number.
         options: at_s [s], camera, size [pixels], scene, headings [rad], pace and fps, as far as what is drawn
@@ -139,49 +137,51 @@ def _draw(
     from magtwin.figures import views
     from magtwin.figures.canvas import save
 
+    path = paths[0]
+    check_free(out, force=force)
     if way == "comparison":
         views.compare_files(*paths, out=out, force=force)
-    elif way == "map":
-        views.plot_maps(paths, out, quantity=show or "overview", headings=given.get("headings"), force=force)
-    elif way == "difference":
-        from magtwin.field.maps.difference import difference
-        from magtwin.figures.maps import draw_difference
+    elif way in ("map", "difference"):
+        from magtwin.figures.maps import draw_difference, draw_map
         from magtwin.io.map_files import open_map
 
-        save(draw_difference(difference(*map(open_map, paths))), out, force=force)
+        fields = [open_map(file) for file in paths]
+        if way == "difference":
+            from magtwin.field.maps.difference import difference
+
+            save(draw_difference(difference(*fields)), out, force=force)
+        elif out.suffix.lower() == ".html":
+            from magtwin.figures.page import write_page
+            from magtwin.figures.reports import page_of_maps
+
+            write_page(page_of_maps(fields, views.floor_plan(path)), out, force=force)
+        else:
+            plan = views.floor_plan(path)
+            save(draw_map(fields, what=show or "overview", plan=plan, **given), out, force=force)
     elif way == "charts":
-        save(_charts(paths[0], given.get("scene")), out, force=force)
-    elif way == "film":
-        views.film(paths[0], out, force=force, advance=advance, **given)
+        from magtwin.figures.reporting import named_run
+        from magtwin.figures.runs import draw_run
+        from magtwin.io.formats import read_run
+
+        named = named_run("", read_run(path), given.get("scene"), path)
+        save(draw_run(named.run, named.field, named.planned), out, force=force)
     elif way == "recording":
         from magtwin.io.rerun.viewer import screenshot
 
-        given["time_s"] = given.pop("at_s", None)
-        return screenshot(paths[0], check_free(out, force=force), force=force, **given)
+        return screenshot(path, out, time_s=given.pop("at_s", None), force=force, **given)
     elif way == "stage":
         from magtwin.figures.pictures import picture_of_stage
         from magtwin.figures.scenery import View
 
         given |= {"camera": View.of(given["camera"]).camera()} if "camera" in given else {}
-        picture_of_stage(paths[0], out, force=force, **given)
+        picture_of_stage(path, out, force=force, **given)
     else:
-        views.picture(paths[0], out, time_s=given.pop("at_s", None), force=force, **given)
+        from magtwin.figures.films import film_of_run
+        from magtwin.figures.scenery import picture_of_run
+
+        run, stage = views.run_and_scene(path, given.pop("scene", None))
+        if way == "film":
+            film_of_run(run, stage, out, speed=given.pop("pace", None), force=force, advance=advance, **given)
+        else:
+            picture_of_run(run, stage, out, time_s=given.pop("at_s", None), force=force, **given)
     return ()
-
-
-def _charts(file: Path, scene: str | Path | None) -> Any:
-    """Charts of a run over its map, if that is at hand."""
-    import warnings
-
-    from magtwin.errors import MismatchWarning
-    from magtwin.figures.runs import draw_run
-    from magtwin.io.formats import read_run
-    from magtwin.io.provenance import map_of, planned_of
-
-    run, field = read_run(file), None
-    try:
-        field = map_of(run, scene, near=file)
-    except InputError as error:
-        if scene is not None:
-            warnings.warn(f"{file}: its map is not shown: {error}", MismatchWarning, stacklevel=2)
-    return draw_run(run, field, planned_of(run, near=file))

@@ -19,7 +19,6 @@ from magtwin.figures.canvas import (
     new_figure,
     picture,
     short_name,
-    zero_line,
 )
 from magtwin.figures.maps import draw_mean
 from magtwin.figures.page import Page, Section, Table
@@ -29,7 +28,7 @@ from magtwin.figures.training import draw_correlations
 from magtwin.learn.data.correlation import correlations
 from magtwin.learn.data.features import FEATURES, FULL, features
 from magtwin.learn.evaluation.budget import TERMS, Budget
-from magtwin.learn.evaluation.evaluation import PAPER, Evaluation, Judged
+from magtwin.learn.evaluation.evaluation import PAPER, Evaluation
 from magtwin.learn.evaluation.scores import COVERED, DRAWS, LEVEL
 from magtwin.report.verdict import Z_90
 from magtwin.run.compare import Traversals
@@ -50,19 +49,22 @@ SHOWN_S = 90.0
 """Length of the part of a run that is shown against time [s]."""
 
 
+LEAD = (
+    "Mean absolute error [nT], with its ratio to that of the naive model in brackets (lower is better). "
+    "The naive model adds the mean training label to the first map. Intervals are "
+    f"{LEVEL:.0%} bootstrap intervals: {DRAWS:,} draws of sessions, runs within them and blocks of time "
+    "within those."
+)
+ONE_SESSION = " With one session only runs and blocks are drawn: the intervals do not cover other sessions."
+
+
 def page_of_evaluation(
     evaluation: Evaluation,
     *,
     budgets: Sequence[Budget] = (),
     both: tuple[Traversals, tuple[str, str]] | None = None,
 ) -> Page:
-    """The report of an evaluation.
-
-    Args:
-        evaluation: Result of `magtwin.learn.evaluation.evaluate.evaluate`.
-        budgets: Error budgets of its models.
-        both: One path driven twice, and the names of the two runs.
-    """
+    """The report of an evaluation, with error budgets and one path driven twice, by two named runs."""
     every = evaluation.every
     against = "the exact field" if evaluation.truth else "the reading"
     verdicts = [f"{name}: {line}" for name, line in evaluation.verdicts().items()]
@@ -78,37 +80,19 @@ def page_of_evaluation(
     lost = tuple(evaluation.left_out.items())
     note = "All models are evaluated on the same readings." if lost else "None."
     left_out = Table("Readings left out", ("reason", "readings"), lost, note, folded=True)
-    charts = [_path_errors(evaluation), *_time_series(evaluation)]
-    pictures = [
-        *(chart.picture() for chart in charts),
-        *_floor_plan(evaluation),
-        *_rank_correlations(evaluation),
-    ]
+    pictures = [chart.picture() for chart in (_path_errors(evaluation), *_time_series(evaluation))]
+    pictures += [*_floor_plan(evaluation), *_rank_correlations(evaluation)]
     sections = (
         Section("Errors", "", tuple(pictures)),
-        Section("Table 1", _lead_of_table(evaluation), (), (_table(evaluation),)),
+        Section("Table 1", LEAD + (ONE_SESSION if every.sessions == 1 else ""), (), (_table(evaluation),)),
         *([_budgets(budgets)] if budgets else []),
         *([section_of_traversals(*both)] if both else []),
-        Section(
-            "Details", "", (), (_intervals(evaluation), _models(evaluation), _maps(evaluation), left_out)
-        ),
+        Section("Details", "", (), (*(f(evaluation) for f in (_intervals, _models, _maps)), left_out)),
     )
     data = evaluation.summary()
     data |= {"budget": {"models": [budget.summary() for budget in budgets]}} if budgets else {}
     data |= {"traversals": both[0].summary()} if both else {}
     return Page("Evaluation", lead, sections, data=data, verdict="\n".join(verdicts), figures=figures)
-
-
-def _lead_of_table(evaluation: Evaluation) -> str:
-    lead = (
-        "Mean absolute error [nT], with its ratio to that of the naive model in brackets (lower is better). "
-        "The naive model adds the mean training label to the first map. Intervals are "
-        f"{LEVEL:.0%} bootstrap intervals: {DRAWS:,} draws of sessions, runs within them and blocks of time "
-        "within those."
-    )
-    if evaluation.every.sessions == 1:
-        lead += " With one session only runs and blocks are drawn: the intervals do not cover other sessions."
-    return lead
 
 
 def _table(evaluation: Evaluation) -> Table:
@@ -248,7 +232,9 @@ def _rank_correlations(evaluation: Evaluation) -> tuple[Picture, ...]:
 
 def _time_series(evaluation: Evaluation) -> list[Chart]:
     """Figure 5: field as measured and by the map alone, and the errors of each model with their interval."""
-    one = _middle(evaluation)
+    best = _best(evaluation)
+    size = [float(np.mean(np.abs(one.errors().error_nt[best]))) for one in evaluation.judged]
+    one = evaluation.judged[int(np.argsort(size, kind="stable")[(len(size) - 1) // 2])]  # the median
     t = one.run["t"] - one.run["t"][0]
     seen = t <= SHOWN_S
     t, kept = t[seen], one.kept[seen]
@@ -271,7 +257,7 @@ def _time_series(evaluation: Evaluation) -> list[Chart]:
             if np.isfinite(half).any():
                 band = {"color": _look(m)["color"], "alpha": 0.2, "lw": 0}
                 ax.fill_between(t[rows], -half, half, label=f"its {COVERED:.0%} interval", **band)
-            zero_line(ax)
+            ax.axhline(0, color=FAINT, lw=0.7, zorder=0)
             finish(ax, "error [nT]")
 
         return draw
@@ -285,18 +271,9 @@ def _time_series(evaluation: Evaluation) -> list[Chart]:
     for m in _trained(evaluation):
         off = np.abs(one.total_nt[m, seen] - one.measured_nt[seen])[kept]
         mae = np.nanmean(off) if np.isfinite(off).any() else np.nan
-        title = (
-            f"Figure 5: errors of {short_name(evaluation.names[m], 40)} on {where}: mean size {mae:.0f} nT"
-        )
-        charts.append(Chart(title, errors(m), file=f"figure_5_{m}"))
+        title = f"Figure 5: errors of {short_name(evaluation.names[m], 40)} on {where}"
+        charts.append(Chart(f"{title}: mean size {mae:.0f} nT", errors(m), file=f"figure_5_{m}"))
     return charts
-
-
-def _middle(evaluation: Evaluation) -> Judged:
-    """The recording in which the error of the best model is the median."""
-    best = _best(evaluation)
-    size = [float(np.mean(np.abs(one.errors().error_nt[best]))) for one in evaluation.judged]
-    return evaluation.judged[int(np.argsort(size, kind="stable")[(len(size) - 1) // 2])]
 
 
 @styled

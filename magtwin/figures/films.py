@@ -52,16 +52,8 @@ def film_of_run(
 ) -> Path:
     """Draw a run as a film.
 
-    Args:
-        run: The run.
-        scene_file: Stage of its lab.
-        out: MP4 (H.264) or GIF to write.
-        fps: Frames per second.
-        speed: Playback speed relative to the run. Default: 1, or more for a film of at most 30 s.
-        camera: "orbit", "top" or "x,y,z:x,y,z", as for `magtwin.figures.scenery.View.of`.
-        size: Width and height [pixel]. Default: 1280 x 720, or 640 x 360 for a GIF.
-        force: Whether to replace an existing file.
-        advance: Called after each frame with the number of frames drawn, and their total.
+    Default of `speed` relative to the run: 1, or more for a film of at most 30 s; of `size`: `SIZES`.
+    `camera` is as for `View.of`; `advance` is called with the number of frames drawn, and their total.
 
     Raises:
         InputError: As for `magtwin.figures.scenery.Scenery`; an option is out of range; `out` is not a film,
@@ -114,10 +106,8 @@ def frame_times(
     wanted = run.duration_s * fps / speed
     if not wanted < most:
         count = f"{wanted:,.0f}" if wanted < 1e15 else f"{wanted:.3g}"
-        raise InputError(
-            f"the film would have {count} frames, and {most:,} are the most; raise the speed",
-            parameter="pace",
-        )
+        text = f"the film would have {count} frames, and {most:,} are the most; raise the speed"
+        raise InputError(text, parameter="pace")
     times = run["t"][0] + np.arange(int(wanted + 1e-9) + 1) * (speed / fps)
     return np.minimum(times, run["t"][-1]), speed
 

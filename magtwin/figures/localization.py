@@ -3,6 +3,8 @@
 import math
 import os
 import textwrap
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter
-from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
@@ -24,7 +26,6 @@ from magtwin.figures.canvas import (
     Chart,
     draw_line,
     evenly,
-    halo,
     label,
     legend_above,
     new_figure,
@@ -42,7 +43,8 @@ from magtwin.io.rerun.localization import write_localization
 from magtwin.tasks.localizing import Localization, truth_name
 
 DEAD_LOOK: dict[str, Any] = {"color": DATA, "ls": (0, (4, 2))}
-BOUND_LOOK: dict[str, Any] = {"color": BOUND, "ls": (0, (1.5, 1.2)), "lw": 1.7}
+BOUND_LOOK: dict[str, Any] = {"color": BOUND, "ls": (0, (1.5, 1.2))}
+RIM = [withStroke(linewidth=3.2, foreground=PAPER)]  # of a line over a map
 BAND_LOOK: dict[str, Any] = {"color": MODEL, "alpha": 0.22, "lw": 0}
 
 ELLIPSE_S = 5.0
@@ -68,20 +70,14 @@ def draw_localization(result: Localization) -> Figure:
     estimate's variances along x and y. The bound is the least standard deviation that any unbiased method
     can have with this map, see `magtwin.localization.bounds`.
 
-    Args:
-        result: Result of `magtwin.tasks.localizing.localization`. Without a true pose, the errors are left
-            out and the standard deviations are drawn alone.
-
-    Returns:
-        A matplotlib figure.
+    Without a true pose, the errors are left out and the standard deviations are drawn alone.
 
     Raises:
         InputError: There is no estimate.
     """
     if not len(result.track.t):
         raise InputError("the run has no readings to draw")
-    belief = result.problem.belief
-    field = belief if isinstance(belief, AnomalyMap) else None
+    field = _map_of(result)
     x0, x1, y0, y1 = _extent(result, field)
     tall = float(np.clip((WIDTH_IN - 2.2) * (y1 - y0) / (x1 - x0), 2.5, 7.0))
     figure = new_figure(WIDTH_IN, tall + 5.7)
@@ -101,8 +97,7 @@ def draw_localization(result: Localization) -> Figure:
 
 def page_of_localization(result: Localization) -> Page:
     """A localization as a page: the verdict, its figures, the path and the errors."""
-    belief = result.problem.belief
-    field = belief if isinstance(belief, AnomalyMap) else None
+    field = _map_of(result)
     x0, x1, y0, y1 = _extent(result, field)
     tall = float(np.clip((canvas.WIDTH_IN - 0.8) * (y1 - y0) / (x1 - x0), 1.5, 6.0))
 
@@ -110,14 +105,11 @@ def page_of_localization(result: Localization) -> Page:
         _draw_floor(ax, result, field)
         ax.set(xlim=(x0, x1), ylim=(y0, y1))
 
-    def position(ax: Axes) -> None:
-        _draw_position(ax, result)
+    def timed(draw: Callable[[Axes, Localization], None], ax: Axes) -> None:
+        draw(ax, result)
         label(ax, "time [s]")
 
-    def heading(ax: Axes) -> None:
-        _draw_heading(ax, result)
-        label(ax, "time [s]")
-
+    position, heading = partial(timed, _draw_position), partial(timed, _draw_heading)
     charts = (
         Chart("The estimated path over the map", floor, tall + 2.0, "path"),
         Chart("Error of the position, and the bound of any method", position, 3.4, "position"),
@@ -125,6 +117,11 @@ def page_of_localization(result: Localization) -> Page:
     )
     lead = _title(result).partition("\n")[0]
     return page_of_report(result.report(), "Localization", f"{lead}.", charts)
+
+
+def _map_of(result: Localization) -> AnomalyMap | None:
+    belief = result.problem.belief
+    return belief if isinstance(belief, AnomalyMap) else None
 
 
 def _extent(result: Localization, field: AnomalyMap | None) -> tuple[float, float, float, float]:
@@ -147,15 +144,18 @@ def _draw_floor(ax: Axes, result: Localization, field: AnomalyMap | None) -> Non
     entries: list[Line2D | Patch] = []
 
     def path(p: Array, name: str, **look: Any) -> None:
-        entries.extend(ax.plot(*p[evenly(len(p), 3000), :2].T, label=name, **halo(), **look))
+        entries.extend(ax.plot(*p[evenly(len(p), 3000), :2].T, label=name, path_effects=RIM, **look))
 
     if result.dead_reckoning is not None:
         path(result.dead_reckoning.pose, _dead_name(result), zorder=3, **DEAD_LOOK)
     if result.truth is not None:
-        path(result.truth, _true_name(result), color=INK, lw=2.0, zorder=4)
+        name = "true path" if truth_name(result.run) == "true pose" else "motion capture"
+        path(result.truth, name, color=INK, lw=2.0, zorder=4)
     trusted = np.where(result.track.lost[:, None], np.nan, pose)
     path(trusted, "estimate", color=MODEL, lw=1.6, zorder=5)
-    rows = _ellipse_rows(t, result.track.lost)
+    ticks = np.arange(t[0], t[-1] + 1e-9, max(ELLIPSE_S, (t[-1] - t[0]) / MOST_ELLIPSES))
+    rows = np.unique(np.searchsorted(t, ticks))
+    rows = rows[~result.track.lost[rows]]
     rows = rows[np.isfinite(result.track.covariance[rows]).all(axis=(1, 2))]
     if len(rows):
         lines = [ellipse(pose[k, :2], result.track.covariance[k, :2, :2]) for k in rows]
@@ -163,9 +163,8 @@ def _draw_floor(ax: Axes, result: Localization, field: AnomalyMap | None) -> Non
         entries.append(Line2D([], [], color=MODEL, lw=1.0, marker="o", mfc="none", ms=9, ls=""))
         entries[-1].set_label("its 2-sigma ellipse")
     start = result.truth if result.truth is not None else pose
-    entries.extend(
-        ax.plot(*start[0, :2], marker="s", ms=7, mfc=PAPER, mec=INK, ls="", zorder=7, label="start")
-    )
+    square: dict[str, Any] = {"marker": "s", "ms": 7, "mfc": PAPER, "mec": INK, "ls": "", "zorder": 7}
+    entries.extend(ax.plot(*start[0, :2], label="start", **square))
     ax.set_aspect("equal")
     label(ax, "x [m]", "y [m]")
     legend_above(ax, 6, handles=entries)
@@ -177,14 +176,6 @@ def ellipse(p_xy: Array, covariance: Array, sigmas: float = 2.0) -> Array:
     angle = np.linspace(0, 2 * np.pi, 49)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     return np.asarray(p_xy + sigmas * (circle * np.sqrt(np.maximum(values, 0.0))) @ axes.T)
-
-
-def _ellipse_rows(t: Array, lost: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Rows at which ellipses are drawn: at even times, without those at which the pose is lost."""
-    every = max(ELLIPSE_S, (t[-1] - t[0]) / MOST_ELLIPSES)
-    ticks = np.arange(t[0], t[-1] + 1e-9, every)
-    rows = np.unique(np.searchsorted(t, ticks))
-    return rows[~lost[rows]]
 
 
 def _draw_position(ax: Axes, result: Localization) -> None:
@@ -207,9 +198,7 @@ def _draw_position(ax: Axes, result: Localization) -> None:
     if error is not None:
         draw_line(ax, t, error, color=MODEL, label="estimate")
     if result.bounds is not None:
-        draw_line(
-            ax, t, result.bounds.correlated, color=BOUND, ls=(0, (1.5, 1.2)), lw=1.8, label="bound, 1 sigma"
-        )
+        draw_line(ax, t, result.bounds.correlated, lw=1.8, label="bound, 1 sigma", **BOUND_LOOK)
     shade(ax, t, track.lost, colour=LOST, name="flagged lost")
     most = max(most, float(np.nanmax(dead)) if dead is not None else 0.0)
     if log:
@@ -236,16 +225,10 @@ def _draw_heading(ax: Axes, result: Localization) -> None:
         most = max(most, float(np.nanquantile(np.abs(error), 0.98)))
     if result.bounds is not None:
         for sign in (-1, 1):
-            draw_line(
-                ax, t, sign * np.degrees(result.bounds.heading), color=BOUND, ls=(0, (1.5, 1.2)), lw=1.6
-            )
+            draw_line(ax, t, sign * np.degrees(result.bounds.heading), lw=1.6, **BOUND_LOOK)
     shade(ax, t, track.lost, colour=LOST)
     ax.set(xlim=(t[0], t[-1]), ylim=(-1.25 * most, 1.25 * most))
     label(ax, y="heading\nerror [°]")
-
-
-def _true_name(result: Localization) -> str:
-    return "true path" if truth_name(result.run) == "true pose" else "motion capture"
 
 
 def _dead_name(result: Localization) -> str:
@@ -268,28 +251,18 @@ def _title(result: Localization) -> str:
 def save_localization(result: Localization, out: str | os.PathLike[str], *, force: bool = False) -> Path:
     """Write the folder of a localization.
 
-    Args:
-        result: Result of `magtwin.tasks.localizing.localization`.
-        out: Folder to make, with run.parquet, localize.rrd, .png and .html, estimate.tum and, if the true
-            pose is known, truth.tum.
-        force: Whether to replace an existing folder.
+    It has run.parquet, localize.rrd, .png and .html, estimate.tum and, if the true pose is known, truth.tum.
 
     Raises:
         InputError: The folder exists, or cannot be written.
     """
-    belief = result.problem.belief
     with output(out, force=force) as folder:
         folder.mkdir()
         result.run.save(folder / "run.parquet")
-        write_localization(
-            result.run,
-            folder / "localize.rrd",
-            anomaly_map=belief if isinstance(belief, AnomalyMap) else None,
-            truth=result.truth,
-            dead_reckoning=None if result.dead_reckoning is None else result.dead_reckoning.pose,
-            bound_m=None if result.bounds is None else result.bounds.correlated,
-            particles=result.track.particles,
-        )
+        shown: dict[str, Any] = {"anomaly_map": _map_of(result), "particles": result.track.particles}
+        shown["dead_reckoning"] = None if result.dead_reckoning is None else result.dead_reckoning.pose
+        shown["bound_m"] = None if result.bounds is None else result.bounds.correlated
+        write_localization(result.run, folder / "localize.rrd", truth=result.truth, **shown)
         save(draw_localization(result), folder / "localize.png")
         (folder / "localize.html").write_text(to_html(page_of_localization(result)), encoding="utf-8")
         _save_tum(folder / "estimate.tum", result.track.t, result.track.pose)

@@ -93,9 +93,6 @@ def draw_map(
             of more than eight. Ignored by the overview.
         plan: Walls, furniture and doors, drawn over each panel.
 
-    Returns:
-        A matplotlib figure.
-
     Raises:
         InputError: There is no map or no heading to show, or the map does not know the quantity.
     """
@@ -147,9 +144,8 @@ def map_charts(fields: Sequence[AnomalyMap], plan: "FloorPlan | None" = None) ->
             x0, x1, y0, y1 = panel.field.extent if plan is None else plan.extent(panel.field.extent)
             tall = float(np.clip((WIDTH_IN - 0.8) * (y1 - y0) / (x1 - x0), 1.4, 6.0))
             draw = partial(_draw_alone, panel=panel, scale=scale, plan=plan)
-            charts.append(
-                Chart(panel.title, draw, tall + 1.1, f"{quantity}_{panel.field.name}".replace(" ", "_"))
-            )
+            file = f"{quantity}_{panel.field.name}".replace(" ", "_")
+            charts.append(Chart(panel.title, draw, tall + 1.1, file))
     return charts
 
 
@@ -176,16 +172,21 @@ def draw_difference(difference: MapDifference) -> Figure:
         reach = max(map(abs, colour_limits(layer, 0))) or 1.0  # all values: the peaks matter here
         cells = draw_cells(ax, grid.x_m, grid.y_m, layer, SIGNED_COLOURS, vmin=-reach, vmax=reach)
         colour_bar(figure, cells, ax, title, below=True)
-        _draw_regions(ax, difference)
+        dx, dy = grid.cell_m
+        for number, region in enumerate(difference.regions[:LISTED], 1):
+            x0, x1, y0, y1 = np.add(region.extent_m, np.array([-dx, dx, -dy, dy]) / 2)
+            ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, ec=INK, lw=1.2))
+            box = {"boxstyle": "round,pad=0.15", "fc": PAPER, "ec": "none", "alpha": 0.8}
+            place: dict[str, Any] = {"textcoords": "offset points", "va": "top"}
+            ax.annotate(str(number), (x0, y1), (2, -2), bbox=box, **place)
     names = [" ".join(t for t in pair if t) for pair in zip(difference.names, difference.days, strict=True)]
     changed, regions = int(difference.changed.any(axis=0).sum()), len(difference.regions)
     words = [
         f"common bias {difference.bias_nt.mean():+.3g} nT",
         f"{changed} of {np.count_nonzero(count)} nodes changed, in {regions} region{'s' * (regions != 1)}",
         f"|z| from {difference.threshold_z:.2f}",
+        *([] if difference.from_variance else ["no variance is known: z by the robust spread"]),
     ]
-    if not difference.from_variance:
-        words.append("no variance is known: z by the robust spread")
     lines = [f"{names[0]} to {names[1]}", *textwrap.wrap(", ".join(words), 100)]
     figure.suptitle("\n".join(lines))
     legend = {"changed region": Patch(facecolor="none", edgecolor=INK)} if regions else {}
@@ -198,15 +199,9 @@ def draw_difference(difference: MapDifference) -> Figure:
 def draw_cells(
     ax: Axes, x_m: Array, y_m: Array, layer: Array, colours: str | Colormap, **look: Any
 ) -> ScalarMappable:
-    """Draw one layer of a map, one cell per node, over hatched grey that shows where it is unknown.
+    """Draw a layer (Y, X) of a map, one cell per node, over hatched grey that shows where it is nan.
 
-    Args:
-        ax: Where to draw.
-        x_m: Nodes along x [m], shape (X,).
-        y_m: Nodes along y [m], shape (Y,).
-        layer: Values, nan where unknown, shape (Y, X).
-        colours: The colour scale, or its name.
-        look: Further options of `pcolormesh`, such as `vmin` and `vmax`.
+    The nodes x_m (X,) and y_m (Y,) are in metres; `look` has further options of `pcolormesh`.
     """
     if np.isnan(layer).any():
         ax.set_facecolor(MASKED)
@@ -380,11 +375,7 @@ QUANTITIES: Mapping[str, _Quantity] = {
         "plasma",
         unknown="masked in some heading",
     ),
-    "sd": _Quantity(
-        lambda field: np.sqrt(np.mean(_sd_nt(field) ** 2, axis=0))[None],
-        "[nT]",
-        SPREAD_COLOURS,
-    ),
+    "sd": _Quantity(lambda field: np.sqrt(np.mean(_sd_nt(field) ** 2, axis=0))[None], "[nT]", SPREAD_COLOURS),
 }
 """Quantities of a map that can be drawn, by name."""
 
@@ -402,7 +393,9 @@ class _Panel:
         self, ax: Axes, scale: "_Scale", plan: "FloorPlan | None"
     ) -> tuple[ScalarMappable, dict[str, Patch]]:
         """Draw the layer and what stands there; returns what a colour bar needs, and a legend's entries."""
-        x, y, layer = _thinned(self)
+        every = -(-max(self.layer.shape) // MOST_NODES_A_SIDE)
+        j, i = (np.unique(np.append(np.arange(0, n, every), n - 1)) for n in self.layer.shape)
+        x, y, layer = self.field.x_m[i], self.field.y_m[j], self.layer[j][:, i]
         keys = {} if plan is None else plan.keys()
         if self.quantity == "mask":
             drawn = draw_cells(ax, x, y, layer, ListedColormap([PALETTE["teal"][0]]), alpha=0.5)
@@ -433,9 +426,8 @@ def _overviews(fields: Sequence[AnomalyMap]) -> list[_Panel | None]:
 
 def _overview(name: str, field: AnomalyMap, *, several: bool) -> _Panel | None:
     """A quantity of the overview; None if the map does not know it."""
-    if (name == "heading effect" and len(field.headings_rad) < 2) or (
-        name == "sd" and field.variance_nt2 is None
-    ):
+    unknown = {"heading effect": len(field.headings_rad) < 2, "sd": field.variance_nt2 is None}
+    if unknown.get(name):
         return None
     layer = _slope(mean_field_nt(field), field) if name == "gradient" else QUANTITIES[name].layers(field)[0]
     title = f"{field.name}, " * several + OVERVIEW[name]
@@ -452,7 +444,10 @@ def _by_heading(
         shown, layers = field.headings_rad[::every], layers[::every]
     else:
         shown = np.asarray(headings, float)
-        layers = _between_headings(field, layers, shown)
+        parts: dict[str, Any] = dict.fromkeys(("variance_nt2", "between_nt2", "harmonic", "recorded_yaw"))
+        values = replace(field, values_nt=layers, valid=np.isfinite(layers), **parts)
+        p_xy = np.stack(np.meshgrid(field.x_m, field.y_m), axis=-1)
+        layers = values.lookup(p_xy[None], shown[:, None, None])  # interpolated as a map is
     if what != "mask" and not np.isfinite(layers).any():
         raise InputError(f"map {field.name!r} has no node whose {what} is known")
     panels = []
@@ -461,13 +456,6 @@ def _by_heading(
         title = f"{field.name}, " * several + f"heading {np.degrees(heading):.4g}°{masked}"
         panels.append(_Panel(title, what, field, layer))
     return panels
-
-
-def _thinned(panel: _Panel) -> tuple[Array, Array, Array]:
-    """Nodes along x and y [m], and values, of as many nodes as can be told apart."""
-    every = -(-max(panel.layer.shape) // MOST_NODES_A_SIDE)
-    j, i = (np.unique(np.append(np.arange(0, n, every), n - 1)) for n in panel.layer.shape)
-    return panel.field.x_m[i], panel.field.y_m[j], panel.layer[j][:, i]
 
 
 @dataclass(frozen=True)
@@ -506,36 +494,6 @@ class _Scale:
         drawn.set_rasterized(True)
         ax.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
         return drawn
-
-
-def _between_headings(field: AnomalyMap, layers: Array, headings: Array) -> Array:
-    """Layers at other headings, interpolated as a map lookup does."""
-    parts: dict[str, Any] = {
-        "variance_nt2": None,
-        "between_nt2": None,
-        "harmonic": None,
-        "recorded_yaw": None,
-    }
-    x, y = np.meshgrid(field.x_m, field.y_m)
-    values = replace(field, values_nt=layers, valid=np.isfinite(layers), **parts)
-    return values.lookup(np.stack([x, y], axis=-1)[None], headings[:, None, None])
-
-
-def _draw_regions(ax: Axes, difference: MapDifference) -> None:
-    """A numbered box around each region that the report lists."""
-    dx, dy = difference.grid.cell_m
-    for number, region in enumerate(difference.regions[:LISTED], 1):
-        x0, x1, y0, y1 = region.extent_m
-        corner = (x0 - dx / 2, y0 - dy / 2)
-        ax.add_patch(Rectangle(corner, x1 - x0 + dx, y1 - y0 + dy, fill=False, ec=INK, lw=1.2))
-        ax.annotate(
-            str(number),
-            (x0 - dx / 2, y1 + dy / 2),
-            xytext=(2, -2),
-            textcoords="offset points",
-            va="top",
-            bbox={"boxstyle": "round,pad=0.15", "fc": PAPER, "ec": "none", "alpha": 0.8},
-        )
 
 
 def _summary(field: AnomalyMap, width: int) -> str:

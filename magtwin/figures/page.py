@@ -143,11 +143,6 @@ class Embedded:
 def write_page(page: Page, path: str | os.PathLike[str], *, force: bool = False) -> None:
     """Write a page as .html or .json, whichever its file name ends in.
 
-    Args:
-        page: The page.
-        path: The file to make.
-        force: Whether to replace an existing file.
-
     Raises:
         InputError: The name has another ending, or the file exists and `force` was not given.
     """
@@ -161,12 +156,6 @@ def write_page(page: Page, path: str | os.PathLike[str], *, force: bool = False)
 
 def write_pages(page: Page, folder: str | os.PathLike[str], name: str, *, force: bool = False) -> None:
     """Write a page as a folder: NAME.html and .json, and its pictures in figures/.
-
-    Args:
-        page: The page.
-        folder: The folder to make.
-        name: Name of the files.
-        force: Whether to replace an existing folder.
 
     Raises:
         InputError: The folder exists and `force` was not given.
@@ -189,11 +178,8 @@ def to_html(page: Page, links: Sequence[str] = ()) -> str:
 
 def to_json(page: Page) -> str:
     """The data of a page as JSON; numbers that are not finite become null."""
-    head = {
-        "magtwin": __version__,
-        "title": page.title,
-        **({"verdict": page.verdict} if page.verdict else {}),
-    }
+    head = {"magtwin": __version__, "title": page.title}
+    head |= {"verdict": page.verdict} if page.verdict else {}
     return json.dumps(_finite({**head, **page.data}), indent=2) + "\n"
 
 

@@ -172,10 +172,6 @@ def picture_of_stage(
 def show_stage(path: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 1000)) -> None:
     """Show a stage in a window, where the mouse turns it; returns when the window is closed.
 
-    Args:
-        path: USD file.
-        size: Width and height of the window [pixel].
-
     Raises:
         InputError: The stage is missing, is not USD or shows nothing; or there is no display.
     """
@@ -269,11 +265,8 @@ def hides(triangles: Array, place: ArrayLike, points: Array) -> bool:
     with np.errstate(divide="ignore", invalid="ignore"):
         share = 1.0 / (across * e1).sum(axis=-1)
         turned = np.cross(off, e1)
-        u, v, t = (
-            (across * off).sum(-1) * share,
-            (ray * turned).sum(-1) * share,
-            (turned * e2).sum(-1) * share,
-        )
+        products = (across * off, ray * turned, turned * e2)
+        u, v, t = (product.sum(-1) * share for product in products)
         return bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < 0.999)).any())
 
 
@@ -281,10 +274,8 @@ def add_shape(plotter: Any, shape: Shape, vertices: NDArray, *, baked: bool = Fa
     """Draw a shape on its own; returns its actor."""
     if shape.texture is not None:
         return add_textured(plotter, shape, vertices)
-    mesh, flat = mesh_of(shape, vertices), shape.vertex_colours is not None
-    if baked and not flat:
-        bake(mesh)
-    return plotter.add_mesh(mesh, opacity=shape.colour[3], **style_of(flat or baked))
+    flat = baked or shape.vertex_colours is not None
+    return plotter.add_mesh(mesh_of(shape, vertices, baked=baked), opacity=shape.colour[3], **style_of(flat))
 
 
 def add_still(
@@ -295,14 +286,9 @@ def add_still(
     *,
     baked: bool = False,
 ) -> tuple[list[Any], Walls, Array]:
-    """Draw what stands still, as one body per look.
+    """Draw what stands still, by its vertices in world [m], as one body per look.
 
-    Args:
-        plotter: The plotter.
-        shapes: The shapes.
-        worlds: Their vertices in world [m].
-        scale: Colour scale of the heat-map, or None.
-        baked: Whether light is put into the colours, so that no frame computes it.
+    If `baked`, light is put into the colours, so that no frame computes it.
 
     Returns:
         The actors that may hide heat-map and robot; the walls; and points of all that a wall must not hide
@@ -325,9 +311,7 @@ def add_still(
             actor = add_shape(plotter, shape, vertices)
             screens += [actor] if hiding else []
             continue
-        mesh = mesh_of(shape, vertices)
-        if baked and not flat:
-            bake(mesh)
+        mesh = mesh_of(shape, vertices, baked=baked)
         bodies.setdefault((hiding, flat or baked, shape.colour[3]), []).append(mesh)
     for (hiding, flat, opacity), meshes in bodies.items():
         actor = plotter.add_mesh(joined(meshes), opacity=opacity, **style_of(flat))
@@ -363,11 +347,10 @@ def _draw(
     in_lab = scale is not None and any(s.prim == scale.prim for s in shapes)
     camera = camera or Camera(elevation_deg=LAB_ELEVATION_DEG if in_lab else Camera.elevation_deg)
     screens, walls, points = add_still(plotter, shapes, worlds, scale)
-    if camera.elevation_deg > 0 and all(
-        s.link for s in shapes
-    ):  # just below everything, in the colour of the background: only shadows on it are visible
+    if camera.elevation_deg > 0 and all(s.link for s in shapes):
         import pyvista
 
+        # just below everything, in the colour of the background: only shadows on it are visible
         low, high = everything.min(axis=0), everything.max(axis=0)
         reach = 3 * float(np.max(high - low))
         middle = (*((low + high) / 2)[:2], low[2] - 1e-3 * reach)
@@ -392,14 +375,8 @@ def view_distance(
     A point at (r, u, b) along the camera's right, up and back axes is D - b in front of it, and is visible
     if |r| <= (D - b) tan(h) and |u| <= (D - b) tan(v).
 
-    Args:
-        points: Points in world [m], shape (N, 3).
-        target: Point in the middle of the view [m], shape (3,).
-        axes: Right, up and back axes of the camera in world, as rows, shape (3, 3).
-        half_angles: Half the horizontal and vertical angle of view [rad].
-
-    Returns:
-        Distance D from the target [m].
+    The points, shape (N, 3), and the target in the middle of the view are in world [m]; the axes, right, up
+    and back, are rows. `half_angles` h and v are half the horizontal and vertical angle of view [rad].
     """
     r, u, b = ((np.asarray(points, float) - target) @ np.asarray(axes, float).T).T
     h, v = half_angles
@@ -415,16 +392,14 @@ def plotter_of(size: tuple[int, int], *, window: bool = False) -> Any:
     """
     missing = [name for name in ("pyvista", "vtkmodules", "imageio_ffmpeg") if find_spec(name) is None]
     if missing:
-        raise InputError(
-            f"pictures and films of stages need {', '.join(missing)}: pip install 'magtwin[view]'"
-        )
+        needed = ", ".join(missing)
+        raise InputError(f"pictures and films of stages need {needed}: pip install 'magtwin[view]'")
     import vtkmodules.vtkRenderingOpenGL2
     from vtkmodules.vtkCommonCore import vtkLogger
     from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
-    refusal = InputError(
-        f"no OpenGL here, so no picture can be drawn; install it: apt-get install {GL_PACKAGES}"
-    )
+    remedy = f"install it: apt-get install {GL_PACKAGES}"
+    refusal = InputError(f"no OpenGL here, so no picture can be drawn; {remedy}")
     if sys.platform == "linux" and not _loads("libX11.so", "libX11.so.6"):  # needed without a screen too
         raise refusal
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)  # it reports each missing way to draw
@@ -460,12 +435,8 @@ def check_size(size: tuple[int, int]) -> None:
     """Refuse a size that cannot be drawn."""
     if not (min(size) >= 16 and max(size) <= 16384):
         raise InputError(f"size must lie in 16..16384 pixels each way, got {size[0]} x {size[1]}")
-    check_room(
-        BYTES_PER_PIXEL * size[0] * size[1],
-        f"a picture of {size[0]} x {size[1]} pixels",
-        "take a smaller `size`",
-        "size",
-    )
+    text = f"a picture of {size[0]} x {size[1]} pixels"
+    check_room(BYTES_PER_PIXEL * size[0] * size[1], text, "take a smaller `size`", "size")
 
 
 def write_png(image: NDArray[np.uint8], path: Path) -> None:
@@ -483,8 +454,8 @@ def style_of(flat: bool) -> dict[str, Any]:
     return {"scalars": "rgb", "rgb": True, "smooth_shading": True, **shading}
 
 
-def mesh_of(shape: Shape, vertices: NDArray) -> Any:
-    """A shape as a mesh with colours at its points; with normals for shading unless it is a map."""
+def mesh_of(shape: Shape, vertices: NDArray, *, baked: bool = False) -> Any:
+    """A shape as a mesh with colours at its points; unless it is a map, with normals or its light."""
     import pyvista
 
     faces: NDArray[np.integer] = shape.faces
@@ -494,11 +465,12 @@ def mesh_of(shape: Shape, vertices: NDArray) -> Any:
     if shape.vertex_colours is not None:
         mesh["rgb"] = (255 * srgb_from_linear(shape.vertex_colours)).round().astype(np.uint8)
         return mesh
-    mesh = mesh.compute_normals(
-        cell_normals=False, split_vertices=True, feature_angle=35, consistent_normals=False
-    )
+    how: Any = {"cell_normals": False, "split_vertices": True, "consistent_normals": False}
+    mesh = mesh.compute_normals(feature_angle=35, **how)
     colour = (255 * np.array(srgb_from_linear(shape.colour[:3]))).round().astype(np.uint8)
     mesh["rgb"] = np.tile(colour, (mesh.n_points, 1))
+    if baked:
+        bake(mesh)
     return mesh
 
 
@@ -560,15 +532,10 @@ def light(plotter: Any, everything: NDArray, *, soft: bool = True) -> None:
 def aim(
     plotter: Any, camera: Camera, everything: NDArray, size: tuple[int, int], *, bar: bool = False
 ) -> None:
-    """Set the camera; without a distance, it sees everything.
+    """Set the camera; without a distance, it sees all points [m], shape (N, 3).
 
-    Args:
-        plotter: The plotter.
-        camera: The camera.
-        everything: Points to keep in view [m], shape (N, 3).
-        size: Width and height [pixel].
-        bar: Whether to keep the points to the left of a colour bar. A camera with a distance has its target
-            in the middle all the same.
+    They are kept to the left of a colour bar, if there is one; a camera with a distance has its target in the
+    middle all the same.
     """
     axes, target = camera.axes(), np.array(camera.target, float)
     if camera.target is None:
@@ -587,11 +554,6 @@ def aim(
     plotter.camera.up = axes[1]
     plotter.camera.view_angle = camera.view_angle_deg
     plotter.renderer.ResetCameraClippingRange()
-
-
-def add_text(plotter: Any, text: str, letters: int) -> Any:
-    """A line of text at the upper left."""
-    return plotter.add_text(text, position=(0.02, 0.93), viewport=True, font_size=letters, color=INK)
 
 
 def add_bar(plotter: Any, colour_map: str, limits: tuple[float, float], title: str, half: str = "") -> None:
@@ -630,14 +592,7 @@ class Cutaway:
     def __init__(
         self, plotter: Any, size: tuple[int, int], screens: Sequence[Any], robot: Sequence[Any] = ()
     ) -> None:
-        """Prepare the pictures of a rendered plotter.
-
-        Args:
-            plotter: The plotter.
-            size: Width and height [pixel].
-            screens: The actors that may hide the subject.
-            robot: The actors that nothing may hide.
-        """
+        """Pictures of a rendered plotter, whose actors `screens` may hide the subject, but not `robot`."""
         others = [a for a in plotter.renderer.actors.values() if not any(a is part for part in robot)]
         self._plotter, self._size = plotter, size
         self._hidden = [actors for actors in (list(screens), others if robot else []) if actors]

@@ -86,13 +86,10 @@ class Player:
 def player_of(
     runs: Sequence[Run], field: AnomalyMap | None, stage: Path | None, *, still: bytes = b""
 ) -> Player:
-    """What plays runs in their lab; the same for the same arguments, to the byte.
+    """What plays one run, or those of robots that drove together, or none; the same for the same arguments.
 
-    Args:
-        runs: One run; one for each robot of a scene that drove together; or none, to show the lab alone.
-        field: The map, or None.
-        stage: The scene, or None. A scene that cannot be shown is left out, and the page says why.
-        still: Picture (PNG) for where the lab cannot be drawn.
+    A scene that cannot be shown is left out, and the page says why. `still` is a picture (PNG) for where the
+    lab cannot be drawn.
     """
     arrays: dict[str, Array] = {}
     robots, notes, rows = [], list[str](), 0

@@ -105,16 +105,8 @@ def draw_scene(twin: Twin) -> Figure:
         ring = [x + radius * math.cos(a) for a in turn], [y + radius * math.sin(a) for a in turn]
         ax.fill(*ring, fc="white", ec=INK, lw=1.2, zorder=6)
         ax.plot(*nose, color=INK, lw=1.6, zorder=7)
-        ax.annotate(
-            placed.robot.name,
-            (x, y - radius),
-            (0, -4),
-            fontsize=8,
-            ha="center",
-            va="top",
-            textcoords="offset points",
-            zorder=7,
-        )
+        below: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "top", "zorder": 7}
+        ax.annotate(placed.robot.name, (x, y - radius), (0, -4), fontsize=8, **below)
     same = f"; the map is {known.mean():,.0f} nT everywhere" if level and known.size else ""
     label(ax, "x [m]", "y [m]", title=f"{scene.name}, from above{same}")
     handles = plan.keys()

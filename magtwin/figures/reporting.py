@@ -7,16 +7,19 @@ from pathlib import Path
 from urllib.parse import quote
 
 from magtwin.errors import InputError, MismatchWarning
-from magtwin.figures.canvas import small
 from magtwin.figures.page import Embedded, Page, Still, to_html, write_page
 from magtwin.figures.player import player_of
 from magtwin.figures.reports import OVERVIEW, NamedRun, overview_of, page_of_runs, together
 from magtwin.figures.runs import still_of
+from magtwin.files.kinds import scene_file
 from magtwin.files.outputs import check_free, output
 from magtwin.io.formats import read_run, runs_in
 from magtwin.io.provenance import map_of, planned_of
 from magtwin.report.summary import span
 from magtwin.run.run import Run
+from magtwin.twin import scene_of
+from magtwin.usd.maps.layer import load_map
+from magtwin.usd.scene import read_scene
 
 MOST_STILLS = 300
 """Most small pictures of a page of several runs, and most pages of a folder."""
@@ -46,8 +49,6 @@ def report_runs(
     Raises:
         InputError: A run or `scene` cannot be read, or the page cannot be written.
     """
-    from magtwin.files.kinds import scene_file
-
     out = check_free(out, force=force)
     scene = None if scene is None else scene_file(scene)
     files = _files(runs)
@@ -70,19 +71,11 @@ def usual_name(runs: Sequence[Source]) -> Path:
 
 
 def report_scene(scene: Path, out: Source, *, force: bool = False) -> Path:
-    """Write a page that shows a scene and its map in 3D, without a run.
-
-    Args:
-        scene: A scene, or any other stage.
-        out: Page to write (.html).
-        force: Whether an existing page is replaced.
+    """Write a page (.html) that shows a scene, or any other stage, and its map in 3D, without a run.
 
     Raises:
         InputError: The stage cannot be read, or shows nothing; or the page cannot be written.
     """
-    from magtwin.usd.maps.layer import load_map
-    from magtwin.usd.scene import read_scene
-
     out, figures, field, lead = check_free(out, force=force), [], None, "A stage without a magnetic map."
     try:
         told = read_scene(scene, check_network=False)
@@ -96,20 +89,17 @@ def report_scene(scene: Path, out: Source, *, force: bool = False) -> Path:
     except InputError as error:
         warnings.warn(f"{scene}: shown without its map: {error}", MismatchWarning, stacklevel=2)
     still = still_of(None, field)
-    player = player_of([], field, scene, still=b"" if still is None else small(still.data))
+    player = player_of([], field, scene, still=b"" if still is None else still.data)
     if not player.lab:
         raise InputError(f"{scene}: shows nothing")
-    write_page(
-        Page(f"Scene: {scene.stem}", lead, (), player=replace(player, figures=figures)), out, force=force
-    )
+    page = Page(f"Scene: {scene.stem}", lead, (), player=replace(player, figures=figures))
+    write_page(page, out, force=force)
     return out
 
 
 def embedded(run: Run, scene: Source | None, height: int) -> Embedded:
     """The page of a run for a notebook; arguments as of `Run.view`."""
-    from magtwin.files.kinds import scene_file
-
-    named = _named("run", run, None if scene is None else scene_file(scene), None)
+    named = named_run("run", run, None if scene is None else scene_file(scene), None)
     return Embedded(to_html(page_of_runs([named])), height)
 
 
@@ -124,12 +114,11 @@ def _each(files: Sequence[Path], scene: Path | None, progress: Progress) -> Iter
     names = [file.name for file in files]
     for k, file in enumerate(files):
         progress(k, len(files), f"reading {file.name}")
-        yield _named(file.name if names.count(file.name) == 1 else str(file), read_run(file), scene, file)
+        yield named_run(file.name if names.count(file.name) == 1 else str(file), read_run(file), scene, file)
 
 
-def _named(name: str, run: Run, scene: Path | None, file: Path | None) -> NamedRun:
-    from magtwin.twin import scene_of
-
+def named_run(name: str, run: Run, scene: Source | None, file: Path | None) -> NamedRun:
+    """A run with its map, planned path and scene, as far as they are at hand."""
     note, field, stage = "", None, None
     try:
         field, stage = map_of(run, scene, near=file), scene_of(run, scene, near=file)
@@ -143,7 +132,7 @@ def _named(name: str, run: Run, scene: Path | None, file: Path | None) -> NamedR
 
 def _still(named: NamedRun, link: str) -> Still | None:
     picture = still_of(named.run, named.field)
-    return None if picture is None else Still(replace(picture, data=small(picture.data)), link, named.name)
+    return None if picture is None else Still(picture, link, named.name)
 
 
 def _write_folder(
@@ -166,7 +155,6 @@ def _write_folder(
         lead = f"{sum(row[3] for row in rows):,} readings in all."
         if len(rows) > MOST_STILLS:
             lead += f" The first {MOST_STILLS:,} runs have pages."
-        index = Page(
-            f"{len(rows):,} runs", lead, (), replace(OVERVIEW, rows=tuple(rows)), stills=tuple(stills)
-        )
+        overview = replace(OVERVIEW, rows=tuple(rows))
+        index = Page(f"{len(rows):,} runs", lead, (), overview, stills=tuple(stills))
         (aside / "index.html").write_text(to_html(index, links), encoding="utf-8")

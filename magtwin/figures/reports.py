@@ -23,8 +23,8 @@ from magtwin.figures.canvas import (
     label,
     legend_above,
     new_figure,
-    short_pair,
-    small,
+    short_name,
+    stretches,
 )
 from magtwin.figures.maps import FloorPlan, map_charts
 from magtwin.figures.page import Page, Section, Table, text_of
@@ -83,11 +83,7 @@ class NamedRun:
 
 
 def page_of_runs(runs: Sequence[NamedRun], *, advance: Callable[[int], None] = lambda done: None) -> Page:
-    """A page about one run or several.
-
-    Args:
-        runs: The runs.
-        advance: Called with the number of runs that are drawn.
+    """A page about one run or several; `advance` is called with the number of runs that are drawn.
 
     Raises:
         InputError: There is no run, or one has no rows.
@@ -104,11 +100,14 @@ def page_of_runs(runs: Sequence[NamedRun], *, advance: Callable[[int], None] = l
     if together([named.run for named in runs]):
         first, every = runs[0], [named.run for named in runs]
         still = path_picture(first.run, first.field, first.planned)
-        data = b"" if still is None else small(still.data)
+        data = b"" if still is None else still.data
         player = player_of(every, first.field, first.stage, still=data)
         title, verdict, lead = _title(first), first.run.report().verdict, _sentence(first.run)
         if len(runs) > 1:
-            verdict = _verdict(every)
+            tally = Tally()
+            for run in every:
+                run.add_to(tally)
+            verdict = tally.verdict(f"the exact field of {len(runs)} robots, one session", holds=HOLDS_ONE)
             title = f"{len(runs)} robots in {first.run.metadata.get('scene', 'a scene')}"
             lead = f"{', '.join(str(run.metadata['robot']) for run in every)} drove together."
         return Page(title, "" if verdict else lead, tuple(sections), player=player, verdict=verdict)
@@ -124,14 +123,6 @@ def together(runs: Sequence[Run]) -> bool:
     return len(runs) == 1 or (len(facts) == 1 and len(robots) == len(runs))
 
 
-def _verdict(runs: Sequence[Run]) -> str:
-    """The verdict on the models of several robots; "" without one."""
-    tally = Tally()
-    for run in runs:
-        run.add_to(tally)
-    return tally.verdict(f"the exact field of {len(runs)} robots, one session", holds=HOLDS_ONE)
-
-
 def _title(named: NamedRun) -> str:
     metadata = named.run.metadata
     title = f"Run: {metadata['path']}" if metadata.get("path") else f"Run {named.name}"
@@ -145,10 +136,8 @@ def _sentence(run: Run) -> str:
         words.append(f"{distance:,.1f} m driven")
     for name in ("controller", "engine", "magnetometer", "network", "map", "seed"):
         if name in run.metadata:
-            text = (
-                f"{run.metadata[name]} {name}" if name == "magnetometer" else f"{name} {run.metadata[name]}"
-            )
-            words.append(text)
+            pair = (name, str(run.metadata[name]))
+            words.append(" ".join(pair[::-1] if name == "magnetometer" else pair))
     return ", ".join(words) + "."
 
 
@@ -167,10 +156,7 @@ def _section(named: NamedRun) -> Section:
             note += f". {100 * coverage:.1f} % of the predictions lie within 2 of their standard deviations"
         head = ("source", "meaning", *(f"{name} [nT]" for name in MEASURES), "readings")
         tables.append(Table("Errors by source", head, rows, note + "."))
-    events = tuple(
-        (name, COLUMNS[name].doc if name in COLUMNS else "", count, _times(spans))
-        for name, count, spans in _events(run)
-    )
+    events = tuple(_events(run))
     head = ("flag", "meaning", "readings", "times [s]")
     tables.append(Table("Events", head, events, "" if events else "None."))
     tables.append(provenance_table(run.metadata))
@@ -182,12 +168,17 @@ def page_of_report(
     report: Report, title: str, lead: str = "", charts: Sequence[Chart] = (), tables: Sequence[Table] = ()
 ) -> Page:
     """A report as a page: its verdict, first figures, charts, and tables, its source folded."""
-    numbers = [f for f in report.figures if isinstance(f.value, float | int)]
-    shown = [(f.name, f"{text_of(f.value)} {f.unit}".strip()) for f in numbers]
+    shown = list(_numbers(report).items())
     tables = (*tables, figures_table(report), provenance_table(report.metadata))
     section = Section(title, "", tuple(chart.picture() for chart in charts), tables)
     data = json.loads(report.to_json())
     return Page(title, lead, (section,), verdict=report.verdict, figures=shown[:5], data=data)
+
+
+def _numbers(report: Report) -> dict[str, str]:
+    """The numbers of a report with their units, by name."""
+    numbers = (f for f in report.figures if isinstance(f.value, float | int))
+    return {f.name: f"{text_of(f.value)} {f.unit}".strip() for f in numbers}
 
 
 def page_of_maps(fields: Sequence[AnomalyMap], plan: FloorPlan | None = None) -> Page:
@@ -221,13 +212,9 @@ def _in_nt(report: Report) -> Report:
 
 def _map_figures(report: Report) -> list[tuple[str, str]]:
     """Five figures of a map."""
-    found = {f.name: f for f in report.figures}
+    found = _numbers(report)
     names = ("mean", "median gradient", "heading amplitude", "standard deviation", "masked nodes")
-    return [
-        (name, f"{text_of(found[name].value)} {found[name].unit}".strip())
-        for name in names
-        if name in found and isinstance(found[name].value, float | int)
-    ]
+    return [(name, found[name]) for name in names if name in found]
 
 
 def _map_verdict(field: AnomalyMap, report: Report) -> str:
@@ -270,11 +257,9 @@ def page_of_check(report: Report) -> Page:
         verdict += f", against {value('naive', 'RMSE'):,.0f} nT of their mean"
     if value(best, "coverage"):
         verdict += f"; its 90 % intervals hold {value(best, 'coverage'):.0f} % of them"
-    chart = Chart(
-        "Errors of each method on readings left out of its fit", draw, 1.4 + 0.3 * len(order), "errors"
-    )
-    table = Table("Methods", head, rows)
-    page = page_of_report(replace(report, verdict=f"{verdict}."), report.title, "", (chart,), (table,))
+    title, table = "Errors of each method on readings left out of its fit", Table("Methods", head, rows)
+    charts = (Chart(title, draw, 1.4 + 0.3 * len(order), "errors"),)
+    page = page_of_report(replace(report, verdict=f"{verdict}."), report.title, "", charts, (table,))
     figures = [("readings", f"{values['readings predicted'].value:,}")]
     figures += [(f"{name}, RMSE", f"{value(name, 'RMSE'):,.0f} nT") for name in order[:4]]
     return replace(page, figures=figures)
@@ -325,20 +310,16 @@ def _coverage(run: Run) -> float | None:
     return float(np.mean(np.abs(error[known]) <= 2 * sd[known])) if known.any() else None
 
 
-def _events(run: Run) -> list[tuple[str, int, list[tuple[float, float]]]]:
-    """Flags that were raised: name, number of readings, and first and last time of each stretch [s]."""
-    events, t = [], run["t"]
-    for name in run:
-        if name.startswith("flag_") and run[name].dtype == bool and run[name].any():
-            edges = np.flatnonzero(np.diff(np.concatenate([[False], run[name], [False]]).astype(int)))
-            spans = [(float(t[first]), float(t[after - 1])) for first, after in edges.reshape(-1, 2)]
-            events.append((name, int(run[name].sum()), spans))
+def _events(run: Run) -> list[tuple[str, str, int, str]]:
+    """Flags that were raised: name, meaning, number of readings, and the time of each stretch [s]."""
+    events = []
+    for name, on in run.items():
+        if name.startswith("flag_") and on.dtype == bool and on.any():
+            ends = [(run["t"][first], run["t"][after - 1]) for first, after in stretches(on)]
+            text = ", ".join(f"{a:.2f}–{b:.2f}" if b > a else f"{a:.2f}" for a, b in ends[:MOST_SPANS])
+            text += f" and {len(ends) - MOST_SPANS:,} more" if len(ends) > MOST_SPANS else ""
+            events.append((name, COLUMNS[name].doc if name in COLUMNS else "", int(on.sum()), text))
     return events
-
-
-def _times(spans: Sequence[tuple[float, float]]) -> str:
-    text = ", ".join(f"{a:.2f}–{b:.2f}" if b > a else f"{a:.2f}" for a, b in spans[:MOST_SPANS])
-    return text + (f" and {len(spans) - MOST_SPANS:,} more" if len(spans) > MOST_SPANS else "")
 
 
 def _measures(agreement: Agreement) -> tuple[float, float, float, float]:
@@ -381,19 +362,12 @@ def page_of_comparison(a: NamedRun, b: NamedRun, comparison: Comparison) -> Page
     tables = [Table("Differences", head, cells, f"{b.name} minus {a.name}.")]
     tables += [provenance_table(one.run.metadata, f"Provenance of {one.name}") for one in (a, b)]
     verdict = f"{b.name} differs from {a.name}: {', '.join(words) or 'nothing can be compared'}, {how}."
-    section = Section("Differences", "", pictures, tuple(tables))
-    return Page(
-        "Two runs compared", "", (section,), verdict=verdict, figures=figures, data=comparison.summary()
-    )
+    sections, data = (Section("Differences", "", pictures, tuple(tables)),), comparison.summary()
+    return Page("Two runs compared", "", sections, verdict=verdict, figures=figures, data=data)
 
 
 def section_of_traversals(both: Traversals, names: tuple[str, str]) -> Section:
-    """A section of a report: one path driven twice, with and without alignment.
-
-    Args:
-        both: Result of `magtwin.run.compare.traversals`.
-        names: Names of the two runs.
-    """
+    """A section of a report: one path driven twice by two runs of these names, with and without alignment."""
     a, b = (NamedRun(name, run) for name, run in zip(names, (both.a, both.b), strict=True))
     rows, pictures = [], []
     for key, text in ALIGNED.items():
@@ -415,12 +389,10 @@ def section_of_traversals(both: Traversals, names: tuple[str, str]) -> Section:
 def _charts(a: NamedRun, b: NamedRun, comparison: Comparison) -> list[Chart]:
     """The field as recorded and aligned, the distance, and both paths, as far as they are known."""
     column, position = field_name(a.run, b.run), position_name(a.run, b.run)
-    names = short_pair((a.name, b.name))
+    names = tuple(short_name(one.name) for one in (a, b))
+    names = names if names[0] != names[1] else (f"A: {names[0]}", f"B: {names[1]}")
     along = "distance driven [m]" if comparison.align == "path" else "time [s]"
-    looks: tuple[dict[str, Any], ...] = (
-        {"color": DATA, "lw": 2.2, "alpha": 0.6},
-        {"color": MODEL, "lw": 1.1},
-    )
+    looks: Any = ({"color": DATA, "lw": 2.2, "alpha": 0.6}, {"color": MODEL, "lw": 1.1})
 
     def lines(
         x: str, y: str, *curves: tuple[Any, Any], names: Sequence[str] = names

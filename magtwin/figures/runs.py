@@ -25,7 +25,6 @@ from magtwin.figures.canvas import (
     new_figure,
     picture,
     shade,
-    zero_line,
 )
 from magtwin.figures.maps import EXTEND, FloorPlan, draw_cells, draw_mean, mean_field_nt
 from magtwin.figures.style import (
@@ -72,9 +71,6 @@ def draw_run(
         planned: The planned path in world [m], shape (M, 2). None leaves it out.
         plan: Walls, furniture and doors. None leaves them out.
 
-    Returns:
-        A matplotlib figure.
-
     Raises:
         InputError: The run has no rows, no clock, or no column of numbers.
     """
@@ -88,7 +84,7 @@ def draw_run(
     figure = new_figure(14.0 if both else 8.0, 8.0 if len(panels) > 3 or not both else 6.0)
     sides = figure.subfigures(1, 1 + both, squeeze=False, width_ratios=(1.1, 1)[: 1 + both])[0]
     if place is not None:
-        if not np.isfinite(run[place][:, :2]).all(axis=1).any():
+        if not len(_places(run, place)):
             raise InputError(f"no position is known in {place!r} of the run")
         draw_path(sides[0].subplots(), run, place, field, planned, plan)
     sides[0].suptitle(_title(run, place), x=0.02, ha="left")
@@ -133,7 +129,7 @@ class Panel:
             look = {"color": MODEL, "alpha": 0.22, "lw": 0, "label": "its 90 % band", "zorder": 1.9}
             ax.fill_between(t[rows], middle - half, middle + half, **look)
         if self.about_zero:
-            zero_line(ax)
+            ax.axhline(0, color=FAINT, lw=0.7, zorder=0)
         if len(self.curves) > 1 or self.band is not None or self.about_zero:
             legend_above(ax)
         ax.margins(x=0)
@@ -146,13 +142,10 @@ def panels_of(run: Run) -> list[Panel]:
     """The graphs that a run has columns for; of a run with none of the usual ones, its first columns."""
     panels = _residuals(run)
     grey, data, model = ({"color": ink} for ink in (SOFT, DATA, MODEL))
-    read = next(
-        (name for name in ("b_measured_nt", "b_total_nt", field_name(run)) if name and _has(run, name)), ""
-    )
-    fields = {
-        "reading" if read == "b_measured_nt" else read: (read, data),
-        "map": ("b_map_nt", model | DASHES),
-    }
+    columns = ("b_measured_nt", "b_total_nt", field_name(run))
+    read = next((name for name in columns if name and _has(run, name)), "")
+    first = "reading" if read == "b_measured_nt" else read
+    fields = {first: (read, data), "map": ("b_map_nt", model | DASHES)}
     speeds = {"driven": ("v_base", data), "commanded": ("v_cmd", model | DASHES)}
     if not _has(run, "v_base"):
         speeds["odometry"] = ("odom_v", grey)
@@ -240,16 +233,7 @@ def draw_path(
     planned: ArrayLike | None,
     plan: FloorPlan | None = None,
 ) -> None:
-    """Draw the path of a run over the map, coloured by its `Trail`.
-
-    Args:
-        ax: Where to draw.
-        run: The run.
-        place: Its column of positions, of which one at least is known.
-        field: The map below it, or None.
-        planned: The planned path in world [m], shape (M, 2), or None.
-        plan: Walls, furniture and doors, or None.
-    """
+    """Draw the path of a run, its column `place`, over the map, coloured by its `Trail`."""
     known = np.isfinite(run[place][:, :2]).all(axis=1)
     p_xy, limits = run[place][known, :2], None
     if field is not None:
@@ -287,6 +271,11 @@ def position_name(*runs: Run) -> str | None:
     return next((name for name in POSITIONS if all(_has(run, name) for run in runs)), None)
 
 
+def _places(run: Run, column: str) -> Array:
+    """The known positions of a column along x and y [m], shape (N, 2)."""
+    return run[column][np.isfinite(run[column][:, :2]).all(axis=1), :2]
+
+
 def _has(run: Run, *names: str) -> bool:
     return all(name in run and np.isfinite(run[name]).any() for name in names)
 
@@ -296,29 +285,19 @@ def path_picture(
     run: Run,
     field: AnomalyMap | None,
     planned: ArrayLike | None,
-    plan: FloorPlan | None = None,
-    kind: str = "png",
 ) -> Picture | None:
-    """The path of a run over its map, or over a bare floor; None if its places or readings are unknown.
-
-    Args:
-        run: The run.
-        field: The map below the path, or None.
-        planned: The planned path in world [m], shape (M, 2), or None.
-        plan: Walls, furniture and doors, or None.
-        kind: "png" or "svg".
-    """
+    """The path of a run over its map, or over a bare floor; None if its places or readings are unknown."""
     position, column = position_name(run), field_name(run)
-    if position is None or column is None or np.isfinite(run[position][:, :2]).all(axis=1).sum() < 2:
+    if position is None or column is None or len(_places(run, position)) < 2:
         return None
-    p_xy = run[position][np.isfinite(run[position][:, :2]).all(axis=1), :2]
+    p_xy = _places(run, position)
     wide, tall = np.ptp(p_xy, axis=0) if field is None else np.ptp(np.reshape(field.extent, (2, 2)), axis=1)
     height = float(np.clip((WIDTH_IN - 0.8) * tall / max(wide, 1e-9), 1.5, 6.0))
     figure = new_figure(WIDTH_IN, height + (1.9 if field is not None else 1.2))
-    draw_path(figure.subplots(), run, position, field, planned, plan)
+    draw_path(figure.subplots(), run, position, field, planned)
     over = "the path" if field is None else f"the path over the map {field.name}"
     what = Trail.of(run).name.removesuffix(" [nT]")
-    return picture(figure, f"Path driven, coloured by {what}", alt=f"{over}, coloured by {what}", kind=kind)
+    return picture(figure, f"Path driven, coloured by {what}", alt=f"{over}, coloured by {what}", kind="png")
 
 
 @styled
@@ -355,7 +334,7 @@ def _title(run: Run, place: str | None) -> str:
     names = [str(run.metadata[key]) for key in ("scene", "path", "network") if run.metadata.get(key)]
     size = [f"{run.rows:,} readings", f"{run.duration_s:.1f} s"]
     if place is not None:
-        steps = np.diff(run[place][np.isfinite(run[place][:, :2]).all(axis=1), :2], axis=0)
+        steps = np.diff(_places(run, place), axis=0)
         size.append(f"{np.linalg.norm(steps, axis=1).sum():.1f} m")
     floor = swept(run.metadata).partition(",")[0]
     size += [floor] if floor else []

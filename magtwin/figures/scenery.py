@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError
 from magtwin.figures.pictures import (
     BACKGROUND,
+    INK,
     LAB_ELEVATION_DEG,
     Camera,
     Cutaway,
     add_bar,
     add_still,
-    add_text,
     aim,
     check_png,
     check_size,
@@ -69,6 +69,9 @@ TRAIL_SPAN_M = 6.0
 UNKNOWN = (150, 150, 150)
 """Colour of the trail where the field is unknown."""
 
+LABEL: Any = {"position": (0.02, 0.93), "viewport": True, "color": INK}
+"""Place and colour of the line of text at the upper left."""
+
 SAMPLES = 4
 """Samples per pixel in frames of a film."""
 
@@ -101,14 +104,11 @@ class View:
         except ValueError:
             x = math.nan
         if not (text.count(":") == 1 and math.isfinite(x) and all(map(math.isfinite, (y, z, tx, ty, tz)))):
-            raise InputError(
-                f"no camera {text!r}; known: {', '.join(KINDS)}; or x,y,z:x,y,z, from where to where",
-                parameter="camera",
-            )
+            known = f"known: {', '.join(KINDS)}; or x,y,z:x,y,z, from where to where"
+            raise InputError(f"no camera {text!r}; {known}", parameter="camera")
         if (x, y, z) == (tx, ty, tz):
-            raise InputError(
-                f"the camera {text!r} looks at its own place; give another target", parameter="camera"
-            )
+            said = f"the camera {text!r} looks at its own place; give another target"
+            raise InputError(said, parameter="camera")
         return cls("fixed", (x, y, z), (tx, ty, tz))
 
     def camera(self, seen_s: float = 0.0) -> Camera:
@@ -153,14 +153,8 @@ class Scenery:
     ) -> None:
         """Build the scenery.
 
-        Args:
-            run: The run, with t and a position: the truth, motion capture or odometry.
-            scene_file: Stage of its lab.
-            times: Ascending times of the frames on the run's clock [s].
-            view: The camera.
-            size: Width and height [pixel].
-            speed: Playback speed relative to the run.
-            fine: Whether to draw smoother edges and shadows in corners, which takes seconds per frame.
+        The run has t and a position: the truth, motion capture or odometry. The times of the frames ascend on
+        its clock [s]. `fine` draws smoother edges and shadows in corners, which takes seconds per frame.
 
         Raises:
             InputError: A column is missing, a time lies outside the run, the stage shows nothing or has no
@@ -168,26 +162,35 @@ class Scenery:
         """
         check_size(size)
         self._times, self._speed, self._view, self._size = np.asarray(times, float), speed, view, size
-        self._position = _position(run)
+        known = (n for n in POSITIONS if n in run and np.isfinite(run[n]).all(axis=1).any())
+        self._position = next(known, "")
+        if not self._position:
+            raise InputError(f"the run has no positions: it has none of {', '.join(POSITIONS)}")
         self._pose(run)
         opened = open_scene(scene_file, check_network=False, lab=str(run.metadata.get("lab", "")))
         stage, scene = opened.stage, opened.scene
         shapes, links = read_shapes(stage), read_links(stage)
         moving = links_of(links, [placed.robot.name for placed in scene.robots], run)
         self._sides = sides_of(scene, run)
-        still = [shape for shape in shapes if shape.link not in moving]
         if not shapes:
             raise InputError(f"{scene_file}: shows nothing")
         self.plotter = plotter_of(size)
         try:
             scale = read_colour_scale(stage)
-            self._build(still, links, [s for s in shapes if s.link in moving], moving, fine, scale)
+            still = [s for s in shapes if s.link not in moving]
+            self._build(still, links, scale, baked=not fine)
+            self._links, self._actors = dict[str, Link](), dict[str, Any]()
+            for name, link in moving.items():
+                own = (s for s in shapes if s.link == name and s.vertex_colours is None)
+                if meshes := [mesh_of(s, s.vertices) for s in own]:
+                    self._links[name] = link
+                    self._actors[name] = self.plotter.add_mesh(joined(meshes), **style_of(False))
             self._build_trail(run, scale)
             light(self.plotter, self._everything, soft=fine)
             if not fine:
                 self.plotter.disable_anti_aliasing()
                 self.plotter.enable_anti_aliasing("msaa", multi_samples=SAMPLES)
-            self._label = add_text(self.plotter, " ", max(8, round(size[1] / 60)))
+            self._label = self.plotter.add_text(" ", font_size=max(8, round(size[1] / 60)), **LABEL)
             self._label.prop.background_color, self._label.prop.background_opacity = BACKGROUND, 0.7
             self._cutaway = Cutaway(self.plotter, size, self._screens, list(self._actors.values()))
         except BaseException:
@@ -226,9 +229,8 @@ class Scenery:
             side = self._sides.get(link.joint)
             if side is not None and link.rolling_axis is not None:
                 half = self._wheels[k, side] / 2
-                T_base_link = T_base_link @ _matrix(
-                    (0, 0, 0), (*np.multiply(link.rolling_axis, np.sin(half)), np.cos(half))
-                )
+                turn = (*np.multiply(link.rolling_axis, np.sin(half)), np.cos(half))
+                T_base_link = T_base_link @ _matrix((0, 0, 0), turn)
             poses[name] = base @ T_base_link
         return poses
 
@@ -261,29 +263,14 @@ class Scenery:
         self._words = [w + fast for w in words]
 
     def _build(
-        self,
-        still: Sequence[Shape],
-        links: Mapping[str, Link],
-        carried: Sequence[Shape],
-        moving: Mapping[str, Link],
-        fine: bool,
-        scale: ColourScale | None,
+        self, still: Sequence[Shape], links: Mapping[str, Link], scale: ColourScale | None, *, baked: bool
     ) -> None:
-        """Build the lab, one body per look, and each link of the robot."""
+        """Build the lab, one body per look."""
         standing = [placed(s.vertices, links[s.link]) if s.link else s.vertices.astype(float) for s in still]
         self._subjects = [v for s, v in zip(still, standing, strict=True) if is_subject(s, scale)]
-        self._screens, self._walls, self._points = add_still(
-            self.plotter, still, standing, scale, baked=not fine
-        )
+        drawn = add_still(self.plotter, still, standing, scale, baked=baked)
+        self._screens, self._walls, self._points = drawn
         self._things = inside(still, standing)
-        self._actors: dict[str, Any] = {}
-        self._links: dict[str, Link] = {}
-        for name, link in moving.items():
-            meshes = [mesh_of(s, s.vertices) for s in carried if s.link == name and s.vertex_colours is None]
-            if not meshes:
-                continue
-            self._actors[name] = self.plotter.add_mesh(joined(meshes), **style_of(False))
-            self._links[name] = link
         self._everything = np.vstack([*standing, self._p]).astype(float)
 
     def _build_trail(self, run: Run, scale: ColourScale | None) -> None:
@@ -312,14 +299,10 @@ class Scenery:
             known = np.isfinite(trail.values[rows])
             share = (trail.values[rows][known] - low) / max(high - low, 1e-9)
             colours[known] = (255 * colormaps[trail.colours](share)[:, :3]).round().astype(np.uint8)
-            two = scale is not None and limits != trail.limits
-            add_bar(
-                self.plotter, trail.colours, trail.limits, trail.name.replace(" − ", "\n− "), "lower" * two
-            )
-            if scale is not None and two:
-                add_bar(
-                    self.plotter, scale.name, (scale.least, scale.greatest), f"map [{scale.unit}]", "upper"
-                )
+            two, title = limits not in (None, trail.limits), trail.name.replace(" − ", "\n− ")
+            add_bar(self.plotter, trail.colours, trail.limits, title, "lower" * two)
+            if scale is not None and limits is not None and two:
+                add_bar(self.plotter, scale.name, limits, f"map [{scale.unit}]", "upper")
         along = np.gradient(p_xy[rows], axis=0)
         along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
         left = np.column_stack([-along[:, 1], along[:, 0]])
@@ -356,16 +339,9 @@ def picture_of_run(
     size: tuple[int, int] = (1600, 1000),
     force: bool = False,
 ) -> Path:
-    """Draw a moment of a run in its lab, with the trail so far, and write a PNG.
+    """Draw a moment of a run in its lab, with the trail so far, and write a PNG of a `size` in pixels.
 
-    Args:
-        run: The run.
-        scene_file: Stage of its lab.
-        out: PNG to write.
-        time_s: Time on the run's clock [s]. Default: the end of the run.
-        camera: "top", "orbit" or "x,y,z:x,y,z", as for `View.of`.
-        size: Width and height [pixel].
-        force: Whether to replace an existing file.
+    Default of the time on the run's clock [s]: its end. `camera` is as for `View.of`.
 
     Raises:
         InputError: As for `Scenery`; or `out` is not a PNG or exists.
@@ -375,24 +351,14 @@ def picture_of_run(
         raise InputError("the run has no readings, so there is nothing to show")
     t = float(run["t"][-1]) if time_s is None else time_s
     if not run["t"][0] <= t <= run["t"][-1]:
-        raise InputError(
-            f"the run goes from {run['t'][0]:g} to {run['t'][-1]:g} s; there is no {t:g} s in it",
-            parameter="time_s",
-        )
+        ends = f"the run goes from {run['t'][0]:g} to {run['t'][-1]:g} s"
+        raise InputError(f"{ends}; there is no {t:g} s in it", parameter="time_s")
     with (
         output(out, force=force) as aside,
         Scenery(run, scene_file, [t], view=view, size=size, fine=True) as scenery,
     ):
         write_png(scenery.frame(0), aside)
     return out
-
-
-def _position(run: Run) -> str:
-    """The best position column of a run."""
-    for name in POSITIONS:
-        if name in run and np.isfinite(run[name]).all(axis=1).any():
-            return name
-    raise InputError(f"the run has no positions: it has none of {', '.join(POSITIONS)}")
 
 
 def links_of(links: Mapping[str, Link], robots: Sequence[str], run: Run) -> dict[str, Link]:
@@ -430,10 +396,8 @@ def _steps(p_xy: Array) -> NDArray[np.intp]:
 
 def placed(points: ArrayLike, link: Link, *, in_base: bool = False) -> Array:
     """Points of a link in world, or in the base of its robot at rest [m], shape (N, 3)."""
-    pose = (
-        (link.p_base_link, link.q_base_link_xyzw) if in_base else (link.p_world_link, link.q_world_link_xyzw)
-    )
-    T = _matrix(*pose)
+    base, world = (link.p_base_link, link.q_base_link_xyzw), (link.p_world_link, link.q_world_link_xyzw)
+    T = _matrix(*(base if in_base else world))
     return np.asarray(points) @ T[:3, :3].T + T[:3, 3]
 
 

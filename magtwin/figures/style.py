@@ -41,8 +41,8 @@ PALETTE: Mapping[str, tuple[str, str]] = {
 
 INK, SOFT, FAINT, LINE, PAPER = (PALETTE[name][0] for name in ("ink", "soft", "faint", "line", "bar"))
 DATA, MODEL, BOUND, OTHER = (PALETTE[name][0] for name in ("data", "model", "green", "violet"))
-PLAN, LIDAR, LOST, MASKED = (PALETTE[name][0] for name in ("red", "lidar", "lost", "masked"))
-"""What is measured, what a model says of it, the best that is possible, another model; a planned path."""
+LIDAR, LOST, MASKED = (PALETTE[name][0] for name in ("lidar", "lost", "masked"))
+"""What is measured, what a model says of it, the best that is possible, another model."""
 
 FIELD_COLOURS, SIGNED_COLOURS, SPREAD_COLOURS, SLOPE_COLOURS = "viridis", "RdBu_r", "cividis", "magma"
 """Colour scales: of a field, of differences about zero, of standard deviations, and of slopes."""
@@ -114,12 +114,7 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
 
 
 def inline_svg(svg: bytes, prefix: str) -> str:
-    """An SVG of `canvas.render` as a part of a page: with variables as colours, and names of its own.
-
-    Args:
-        svg: The file.
-        prefix: What no other picture of the page has.
-    """
+    """An SVG of `canvas.render` for a page: with variables as colours, and names with a prefix of its own."""
     text = svg.decode("utf-8")
     text = re.sub(r"^.*?(?=<svg)|<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", text, flags=re.S)
     text = re.sub(r' xmlns(:\w+)?="[^"]*"| version="1\.1"|(?<=<svg) width="[^"]*" height="[^"]*"', "", text)

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from magtwin.figures.canvas import WIDTH_IN, label, legend_below, new_figure
+from magtwin.figures.canvas import WIDTH_IN, label, new_figure
 from magtwin.figures.style import DATA, FAINT, INK, MODEL, SOFT, styled
 from magtwin.learn.data.correlation import PAPER, Correlations
 from magtwin.learn.models.predictor import Epoch
@@ -19,24 +19,15 @@ def draw_learning_curve(
 ) -> Figure:
     """Draw the errors on the training and the validation rows over the epochs.
 
-    Args:
-        history: Result of `magtwin.learn.training.fit_network.train`.
-        naive_rmse_nt: Error of the mean training label on the validation rows [nT], drawn as a line.
-        title: Title of the picture.
+    `naive_rmse_nt` is the error of the mean training label on the validation rows [nT], drawn as a line.
     """
     figure = new_figure(WIDTH_IN, 3.4)
     ax = figure.subplots()
     numbers = [epoch.number for epoch in history]
     mark = "." if len(numbers) <= 60 else ""
     ax.plot(numbers, [e.train_rmse_nt for e in history], color=DATA, marker=mark, label="training")
-    ax.plot(
-        numbers,
-        [e.val_rmse_nt for e in history],
-        color=MODEL,
-        ls=(0, (6, 1.2)),
-        marker=mark,
-        label="validation",
-    )
+    look: dict[str, Any] = {"color": MODEL, "ls": (0, (6, 1.2)), "marker": mark, "label": "validation"}
+    ax.plot(numbers, [e.val_rmse_nt for e in history], **look)
     if naive_rmse_nt is not None:
         ax.axhline(naive_rmse_nt, color=SOFT, ls=":", label="validation, naive mean")
     kept = next(epoch for epoch in reversed(history) if epoch.best)
@@ -46,7 +37,7 @@ def draw_learning_curve(
     label(ax, "epoch", "RMSE [nT]")
     ax.grid()
     ax.set_title(title)
-    legend_below(figure)
+    figure.legend(loc="outside lower center", ncols=2)
     return figure
 
 
@@ -68,12 +59,11 @@ def draw_correlations(correlations: Correlations) -> Figure:
         ax.plot(*zip(*paper, strict=True), "D", color=MODEL, ms=5, label="the paper's Figure 2")
     for i in np.flatnonzero(np.isnan(correlations.rho)).tolist():
         ax.text(0.01, i, "never varies", va="center", color=SOFT)
-    reach = np.nanmax(np.abs(np.append(rho, 0.4)) + np.nan_to_num(np.append(sd, 0.0)))
-    reach = min(1.1 * reach, 1.05)
+    reach = min(1.1 * np.nanmax(np.abs(np.append(rho, 0.4)) + np.nan_to_num(np.append(sd, 0.0))), 1.05)
     ax.set(xlim=(-reach, reach), ylim=(count - 0.4, -0.6))
     ax.set_yticks(y, names)
     ax.axvline(0, color=FAINT, lw=0.8)
     label(ax, "Spearman's correlation with the disturbance")
     ax.grid(axis="x")
-    legend_below(figure, columns=1)
+    figure.legend(loc="outside lower center", ncols=1)
     return figure

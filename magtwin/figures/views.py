@@ -1,106 +1,67 @@
-"""Views of files: show, draw or film a run or a stage; two runs compared."""
+"""Views of files: show a run or a stage; two runs compared."""
 
 import tempfile
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.figures.canvas import save
-from magtwin.figures.maps import FloorPlan, draw_map
+from magtwin.figures.maps import FloorPlan
 from magtwin.figures.page import write_page
-from magtwin.figures.reports import (
-    NamedRun,
-    draw_comparison,
-    page_of_comparison,
-    page_of_maps,
-)
-from magtwin.files.file import existing
-from magtwin.files.outputs import check_free
+from magtwin.figures.reports import NamedRun, draw_comparison, page_of_comparison
+from magtwin.files.file import existing, shipped
+from magtwin.files.kinds import USD_SUFFIXES, shipped_or
 from magtwin.io.convert import twin_to_show
 from magtwin.io.formats import read_run
 from magtwin.run.compare import Comparison, compare
 from magtwin.run.run import Run
+from magtwin.twin import scene_of
 from magtwin.usd.layers import stage_sha256
-
-STAGES = (".usd", ".usda", ".usdc", ".usdz")
+from magtwin.usd.scene import open_scene
 
 Source = str | Path
 
 
 def view(files: Sequence[Source], *, scene: Source | None = None) -> None:
-    """Show runs in the Rerun viewer, or a stage in a window, until it is closed.
+    """Show runs on one timeline in the Rerun viewer, or a stage in a window, until it is closed.
 
-    Args:
-        files: Runs in any format, on one timeline; or one stage.
-        scene: Stage to show runs in. None: the one of the metadata.
+    `scene` is the stage to show runs in, by default the one of their metadata.
 
     Raises:
         InputError: A file cannot be read, or there is no viewer.
     """
-    from magtwin.files.kinds import shipped_or
+    from magtwin.io.rerun.file import show_run, write_comparison
+    from magtwin.io.rerun.viewer import show
+    from magtwin.usd.animation import is_animation
 
     paths = [shipped_or(file) for file in files]
     if not paths:
         raise InputError("name a run or a stage to view")
     if len(paths) > 1:
-        _view_together(paths, scene)
-    elif paths[0].suffix.lower() in STAGES and not paths[0].is_dir():
-        _view_stage(paths[0])
+        alike = len({path.stem for path in paths}) < len(paths)
+        runs = {str(path) if alike else path.stem: read_run(path) for path in paths}
+        if len(runs) < len(paths):
+            raise InputError("one run is named twice; name each once")
+        twin = twin_to_show(next(iter(runs.values())), paths[0], scene)
+        with tempfile.TemporaryDirectory() as folder:
+            rrd = Path(folder) / "runs.rrd"
+            write_comparison(runs, rrd, twin)
+            show(rrd, source=paths[0])
+        return
+    file, suffix = paths[0], paths[0].suffix.lower()
+    is_usd = suffix in USD_SUFFIXES and not file.is_dir()
+    existing(file, "stage" if is_usd else "run")
+    if is_usd and (suffix == ".usdz" or not is_animation(file)):
+        from magtwin.figures.pictures import show_stage
+
+        show_stage(file)
+    elif suffix == ".rrd" and scene is None:
+        show(file)
     else:
-        _view_run(paths[0], scene)
-
-
-def picture(
-    file: Source, out: Source, *, scene: Source | None = None, force: bool = False, **options: Any
-) -> None:
-    """Draw a moment of a run in its lab, as a PNG.
-
-    Args:
-        file: Run in any format.
-        out: PNG to write.
-        scene: Scene of the run. None: the one of the metadata.
-        force: Whether an existing output is replaced.
-        options: Of `magtwin.figures.scenery.picture_of_run`: camera, time_s, size.
-
-    Raises:
-        InputError: The file cannot be read or drawn, or the output exists.
-    """
-    from magtwin.figures.scenery import picture_of_run
-
-    file, out = existing(file, "run"), check_free(out, force=force)
-    run, stage = _run_and_scene(file, scene)
-    picture_of_run(run, stage, out, force=force, **options)
-
-
-def film(
-    file: Source,
-    out: Source,
-    *,
-    scene: Source | None = None,
-    pace: float | None = None,
-    force: bool = False,
-    **options: Any,
-) -> None:
-    """Film a run in its lab.
-
-    Args:
-        file: Run in any format.
-        out: MP4 or GIF to write.
-        scene: Scene of the run. None: the one of the metadata.
-        pace: Simulated seconds per second of film. None: 1, or more for a film of at most 30 s.
-        force: Whether an existing output is replaced.
-        options: Of `magtwin.figures.films.film_of_run`: camera, fps, size, advance.
-
-    Raises:
-        InputError: The file cannot be read or drawn, or the output exists.
-    """
-    from magtwin.figures.films import film_of_run
-
-    file, out = existing(file, "run"), check_free(out, force=force)
-    run, stage = _run_and_scene(file, scene)
-    film_of_run(run, stage, out, speed=pace, force=force, **options)
+        run = read_run(file)
+        show_run(run, twin_to_show(run, file, file if is_usd else scene), file=file)
 
 
 def compare_files(
@@ -111,14 +72,7 @@ def compare_files(
     out: Source | None = None,
     force: bool = False,
 ) -> Comparison:
-    """Compare two runs, and draw the comparison.
-
-    Args:
-        a: First run, in any format.
-        b: Second run.
-        align: As for `magtwin.run.compare.compare`.
-        out: Picture (.png, .svg) or page (.html) to write.
-        force: Whether an existing output is replaced.
+    """Compare two runs in any format, and draw the comparison as a picture (.png, .svg) or a page (.html).
 
     Raises:
         InputError: A run cannot be read, they do not overlap, or the output cannot be written.
@@ -135,40 +89,9 @@ def compare_files(
     return comparison
 
 
-def plot_maps(
-    files: Sequence[Source],
-    out: Source,
-    *,
-    quantity: str = "overview",
-    headings: Sequence[float] | None = None,
-    force: bool = False,
-) -> None:
-    """Draw maps as a picture or a page, with what stands on the floor if the scene of the first is at hand.
-
-    Args:
-        files: Up to four maps, as for `magtwin.io.map_files.open_map`; several are drawn on common scales.
-        out: Picture (.png, .svg) or page (.html) to write.
-        quantity: As for `magtwin.figures.maps.draw_map`; a page has the overview.
-        headings: Headings to show [rad], or None.
-        force: Whether an existing output is replaced.
-
-    Raises:
-        InputError: A map cannot be read or drawn, or the output cannot be written.
-    """
-    from magtwin.io.map_files import open_map
-
-    fields, plan = [open_map(file) for file in files], floor_plan(files[0])
-    if Path(out).suffix.lower() == ".html":
-        write_page(page_of_maps(fields, plan), out, force=force)
-    else:
-        save(draw_map(fields, what=quantity, headings=headings, plan=plan), out, force=force)
-
-
 def floor_plan(source: Source) -> FloorPlan | None:
     """What stands on the floor of a map: by its stage, or by the stage beside it, if that reads this map."""
-    from magtwin.files.file import shipped
     from magtwin.io.map_files import map_file
-    from magtwin.usd.scene import open_scene
 
     path = map_file(source)
     folders = [path.parent, path.parent.parent, shipped("scenes") / path.resolve().parent.name]
@@ -190,53 +113,11 @@ def names_of(a: Path, b: Path) -> tuple[str, str]:
     return (a.name, b.name) if a.name != b.name else (str(a), str(b))
 
 
-def _run_and_scene(file: Path, scene: Source | None) -> tuple[Run, Path]:
+def run_and_scene(file: Path, scene: Source | None) -> tuple[Run, Path]:
     """A run and its scene; warns if the scene has changed since."""
-    from magtwin.twin import scene_of
-
     run = read_run(file)
     stage = scene_of(run, scene, near=file)
     if "scene_sha256" in run.metadata and run.metadata["scene_sha256"] != stage_sha256(stage):
-        warnings.warn(
-            f"{stage} has changed since the run; it is drawn as it is now", MismatchWarning, stacklevel=3
-        )
+        text = f"{stage} has changed since the run; it is drawn as it is now"
+        warnings.warn(text, MismatchWarning, stacklevel=3)
     return run, stage
-
-
-def _view_run(file: Path, scene: Source | None) -> None:
-    from magtwin.io.rerun.file import show_run
-    from magtwin.io.rerun.viewer import show
-
-    existing(file, "run")
-    if file.suffix.lower() == ".rrd" and scene is None:
-        show(file)
-    else:
-        run = read_run(file)
-        show_run(run, twin_to_show(run, file, scene), file=file)
-
-
-def _view_together(files: Sequence[Path], scene: Source | None) -> None:
-    from magtwin.io.rerun.file import write_comparison
-    from magtwin.io.rerun.viewer import show
-
-    alike = len({file.stem for file in files}) < len(files)
-    runs = {str(file) if alike else file.stem: read_run(file) for file in files}
-    if len(runs) < len(files):
-        raise InputError("one run is named twice; name each once")
-    twin = twin_to_show(next(iter(runs.values())), files[0], scene)
-    with tempfile.TemporaryDirectory() as folder:
-        rrd = Path(folder) / "runs.rrd"
-        write_comparison(runs, rrd, twin)
-        show(rrd, source=files[0])
-
-
-def _view_stage(file: Path) -> None:
-    from magtwin.usd.animation import is_animation
-
-    existing(file, "stage")
-    if file.suffix.lower() != ".usdz" and is_animation(file):
-        _view_run(file, file)
-    else:
-        from magtwin.figures.pictures import show_stage
-
-        show_stage(file)

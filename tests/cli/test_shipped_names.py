@@ -8,8 +8,8 @@ import pytest
 from magtwin import load_run
 from magtwin.cli import main
 from magtwin.errors import InputError
+from magtwin.figures.drawing import draw
 from magtwin.figures.reporting import report_runs
-from magtwin.figures.views import film
 from magtwin.files.kinds import scene_file, shipped_or
 from magtwin.io.convert import convert_run
 from magtwin.io.formats import runs_in
@@ -37,7 +37,7 @@ def elsewhere(tmp_path, monkeypatch):
 def test_a_missing_scene_that_was_named_is_refused(run, elsewhere, scene):
     for shown in (
         lambda: report_runs([run], "z.html", scene=scene),
-        lambda: film(run, "z.gif", scene=scene),
+        lambda: draw([run], "z.gif", scene=scene),
         lambda: convert_run(run, "z.rrd", scene=scene),
         lambda: repeat_of(run, scene),
     ):

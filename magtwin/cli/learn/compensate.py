@@ -1,7 +1,7 @@
 """`magtwin model compensate`: remove the platform's field from a run, by Tolles and Lawson's model."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from cyclopts import App
 
@@ -56,13 +56,8 @@ def fit(
     out = named(out, (".json",), "a Tolles-Lawson model", force=force)
     names = tuple(name.strip() for name in terms.split(",") if name.strip())
     step("Fitting the model")
-    model = fit_run(
-        read_parquet(expected(run, "run")),
-        terms=names,
-        band_hz=None if no_band else band_hz,
-        ridge=penalty,
-        preset=preset,
-    )
+    how: Any = {"band_hz": None if no_band else band_hz, "ridge": penalty, "preset": preset}
+    model = fit_run(read_parquet(expected(run, "run")), terms=names, **how)
     with output(out, force=force) as aside:
         model.save(aside)
     return Done(model.report(f"Tolles-Lawson model of {run}"), out)

@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import RECORDED, Force, Jobs, RecordedOptions, pairs
-from magtwin.cli.terminal import Done, progress, step
+from magtwin.cli.options import RECORDED, Folder, Force, Jobs, RecordedOptions, pairs
+from magtwin.cli.terminal import Done, named, progress, step
 from magtwin.errors import InputError
 
 dataset_app = App(name="dataset", help="Data sets: recordings with labels on a map, to train on.")
@@ -21,7 +21,7 @@ def build(
     run: Annotated[list[Path], Parameter(negative="")],
     *,
     map: Path,  # noqa: A002
-    out: Path,
+    out: Folder,
     alignment: Literal["fit", "none"] = "none",
     lever_arm_m: tuple[float, float] | None = None,
     latency_s: float | None = None,
@@ -42,8 +42,6 @@ def build(
         folder that `magtwin sweep` made stands for all of its runs.
     map
         Map that the labels are made on: a layer or stage, or a folder of survey CSVs.
-    out
-        Folder to make.
     alignment
         fit: fit the sensor's lever arm and latency to all recordings; none: use pose and reading as they are.
     lever_arm_m
@@ -62,7 +60,6 @@ def build(
     jobs
         Number of processes that share the recordings. Default: one, with several threads.
     """
-    from magtwin.files.outputs import free
     from magtwin.learn.data.alignment import Alignment
     from magtwin.tasks.learning import build_dataset
 
@@ -73,22 +70,12 @@ def build(
     columns = pairs("column", column, "NAME=THEIRS, such as yaw=heading")
     if len(set(columns.values())) < len(columns):
         raise InputError(f"--column names one column twice, got {' '.join(column or ())}")
+    how: Any = {"session_by": session_by, "path_by": path_by, "rate_hz": rate_hz, "jobs": jobs}
+    how |= {"alignment": "fit" if alignment == "fit" else known, "force": force}
     reading = recorded.options | ({"columns": columns} if columns else {})
-    (out,) = free(out, force=force)
+    out = named(out, force=force)
     with progress("Labelling", "recordings") as advance:
-        made = build_dataset(
-            run,
-            out=out,
-            anomaly_map=map,
-            alignment="fit" if alignment == "fit" else known,
-            session_by=session_by,
-            path_by=path_by,
-            rate_hz=rate_hz,
-            jobs=jobs,
-            force=force,
-            progress=advance,
-            **reading,
-        )
+        made = build_dataset(run, out=out, anomaly_map=map, progress=advance, **how, **reading)
     train = ("magtwin", "train", out, "--out", f"{out.name}.safetensors")
     return Done(made.report(), out, next=(train, ("magtwin", "dataset", "info", out)))
 

@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Flag, Force, Names, Seed, pairs, reads_recordings
-from magtwin.cli.terminal import Done, progress, step, width
+from magtwin.cli.terminal import Done, named, progress, step, width
 from magtwin.errors import InputError
 from magtwin.report.summary import aligned, clipped
 
@@ -79,7 +79,6 @@ def evaluate(
 
     from magtwin.figures.evaluations import NAME, page_of_evaluation
     from magtwin.figures.page import to_json, write_pages
-    from magtwin.files.outputs import free
     from magtwin.learn.evaluation.evaluation import TOTALS
     from magtwin.tasks.learning import error_budget, map_of_scene
     from magtwin.tasks.learning import evaluate as evaluate_models
@@ -93,20 +92,12 @@ def evaluate(
     cases = pairs("case", case, "a row of the table and its path, such as D=lawnmower.csv")
     if taken := cases.keys() & set(TOTALS):
         raise InputError(f"--case {min(taken)} is a row of the table already; take another name")
-    (out,) = free(out, force=force)
+    out = named(out, force=force)
     step("Reading maps, weights and recordings")
     with progress("Judging", "recordings") as advance:
-        evaluation = evaluate_models(
-            weights,
-            dataset or runs or [],
-            anomaly_map=map or ([] if scene is None else [map_of_scene(scene)]),
-            train=train,
-            cases=cases,
-            any_map=any_map,
-            truth=truth,
-            seed=seed,
-            progress=advance,
-        )
+        how: Any = {"train": train, "cases": cases, "any_map": any_map, "truth": truth, "seed": seed}
+        how["anomaly_map"] = map or ([] if scene is None else [map_of_scene(scene)])
+        evaluation = evaluate_models(weights, dataset or runs or [], progress=advance, **how)
     budgets: tuple[Any, ...] = ()
     if scene is not None and train is not None:
         with progress("Error budgets", "models") as advance:
@@ -116,13 +107,9 @@ def evaluate(
     page = page_of_evaluation(evaluation, budgets=budgets, both=both)
     write_pages(page, out, NAME, force=force)
     html = out / f"{NAME}.html"
-    return Done(
-        lines=_lines(evaluation),
-        wrote=(html, html.with_suffix(".json")),
-        data=loads(to_json(page)),
-        rest=str(html),
-        next=[("magtwin", "info", weights[0])],
-    )
+    wrote, following = (html, html.with_suffix(".json")), [("magtwin", "info", weights[0])]
+    data, lines = loads(to_json(page)), _lines(evaluation)
+    return Done(lines=lines, wrote=wrote, data=data, rest=str(html), next=following)
 
 
 def _overlaid(evaluation: "Evaluation", overlay: Path) -> "tuple[Traversals, tuple[str, str]]":

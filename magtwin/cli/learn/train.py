@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force, Names, Whole
-from magtwin.cli.terminal import Done, check_suffix, progress
+from magtwin.cli.terminal import Done, named, progress
 from magtwin.errors import InputError
 from magtwin.files.kinds import SWEEP, kind_of
 
@@ -76,11 +76,10 @@ def train(
 
     from magtwin.figures.canvas import save
     from magtwin.figures.training import draw_learning_curve
-    from magtwin.files.outputs import free, transaction
+    from magtwin.files.outputs import transaction
     from magtwin.learn.training.config import TrainConfig, read_config
     from magtwin.learn.training.train import train as train_model
 
-    check_suffix(out, (".safetensors",), "a network")
     if dataset.is_dir() and kind_of(dataset) in (None, SWEEP):
         build = f"magtwin dataset build {dataset} --map MAP --out SET"
         raise InputError(f"{dataset}: is no data set; build one from the runs first: {build}")
@@ -89,7 +88,7 @@ def train(
     names = [field.name for field in fields(base) if given.get(field.name) is not None]
     options = base.with_options(**{name: given[name] for name in names})
     beside = (".md",) if options.epochs is None else (".md", ".png")
-    (out,) = free(out, beside=beside, force=force)
+    out = named(out, (".safetensors",), "a network", beside=beside, force=force)
     with transaction():
         with progress("Training", "rows") as show:
             pace = _Pace(show, options.epochs)

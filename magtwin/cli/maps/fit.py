@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -18,6 +18,7 @@ from magtwin.io.surveys.columns import About, Columns
 from magtwin.report.report import Report
 
 COLUMNS = Columns()
+READINGS = "a map layer, or a file of readings,"
 KeepStuck = Annotated[Flag, Parameter(help="Keep readings of a sensor that was stuck.")]
 
 
@@ -94,7 +95,7 @@ def map_import(
     from magtwin.io.surveys.maps import import_survey
 
     out = out or Path(f"{Path(sources[0]).stem}.usdc")
-    out = named(out, (*LAYERS, ".parquet"), "a map layer, or a file of readings,", force=force)
+    out = named(out, (*LAYERS, ".parquet"), READINGS, force=force)
     with progress("Reading the survey") as advance:
         report = import_survey(sources, out, about=about, progress=advance, force=force, **vars(reading))
     return _done(report, out)
@@ -135,21 +136,12 @@ def map_fit(
     from magtwin.io.surveys.maps import fit_survey
 
     out = named(out, LAYERS, "a map layer", force=force)
-    angles = None if headings_deg is None else headings_rad(headings_deg)
+    how: Any = {"method": method, "kernel": kernel, "spacing_m": spacing_m, "keep_stuck": keep_stuck}
+    how["headings_rad"] = None if headings_deg is None else headings_rad(headings_deg)
     work = "Choosing the method of the map" if method == "auto" else f"Fitting the {method} map"
     with _as_imported(sources), progress(work) as advance:
-        report = fit_survey(
-            sources,
-            out,
-            method=method,
-            kernel=kernel,
-            earth_nt=None if earth is None else earth_nt(earth),
-            spacing_m=spacing_m,
-            headings_rad=angles,
-            keep_stuck=keep_stuck,
-            progress=advance,
-            force=force,
-        )
+        how["earth_nt"] = None if earth is None else earth_nt(earth)
+        report = fit_survey(sources, out, progress=advance, force=force, **how)
     return _done(report, out)
 
 
@@ -191,15 +183,9 @@ def map_validate(
 
     page = None if out is None else named(out, (".html",), "a page", force=force)
     with _as_imported(sources), progress("Predicting the readings left out") as advance:
-        report = validate_methods(
-            sources,
-            methods=method,
-            split=split,
-            kernel=kernel,
-            earth_nt=None if earth is None else earth_nt(earth),
-            keep_stuck=keep_stuck,
-            progress=advance,
-        )
+        how: Any = {"methods": method, "split": split, "kernel": kernel, "keep_stuck": keep_stuck}
+        how["earth_nt"] = None if earth is None else earth_nt(earth)
+        report = validate_methods(sources, progress=advance, **how)
     if page is not None:
         from magtwin.figures.page import write_page
         from magtwin.figures.reports import page_of_check
@@ -264,30 +250,13 @@ def map_survey(
     jobs
         Number of processes that share the headings. Default: one, with several threads.
     """
+    given: dict[str, Any] = dict(locals())
     from magtwin.files.kinds import scene_file
     from magtwin.twin.maps import survey_scene
 
-    scene = scene_file(scene)
-    out = named(out, (*LAYERS, ".parquet"), "a map layer, or a file of readings,", force=force)
-    angles = headings_rad(headings_deg)
-    with progress(f"Surveying {scene.name}", "headings") as advance:
-        report = survey_scene(
-            scene,
-            out,
-            adopt=adopt,
-            lab=lab,
-            spacing_m=spacing_m,
-            headings_rad=angles,
-            readings=readings,
-            height_m=height_m,
-            heading_error_deg=heading_error_deg,
-            position_error_m=position_error_m,
-            seed=seed,
-            name=name,
-            licence=licence,
-            created=created,
-            jobs=jobs,
-            progress=advance,
-            force=force,
-        )
+    stage = scene_file(given.pop("scene"))
+    out = named(given.pop("out"), (*LAYERS, ".parquet"), READINGS, force=force)
+    angles = headings_rad(given.pop("headings_deg"))
+    with progress(f"Surveying {stage.name}", "headings") as advance:
+        report = survey_scene(stage, out, headings_rad=angles, progress=advance, **given)
     return _done(report, out)

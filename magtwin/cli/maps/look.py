@@ -92,10 +92,9 @@ def map_export(file: MapFile, *, out: Path, force: Force = False) -> Done:
         Folder to make: 0_map.csv, 90_map.csv, ..., rows of x [m], y [m], heading [rad], field [nT].
     """
     from magtwin.field.survey.nodes import write_survey
-    from magtwin.files.outputs import free
     from magtwin.io.map_files import open_map
 
-    (out,) = free(out, force=force)
+    out = named(out, force=force)
     files = write_survey(open_map(file), out, force=force)
     again = ("magtwin", "map", "import", out, "--out", f"{out.name}.usdc")
     return Done(wrote=tuple(files), next=(again,))
@@ -124,10 +123,6 @@ def map_occupancy(scene: Path, *, out: Path, resolution_m: float | None = None, 
     grid = occupancy_of(room_of(open_twin(scene, magnetometer="map-only")), resolution_m=resolution_m)
     wrote = grid.save(out, force=force)
     rows, columns = grid.cells.shape
-    data = {
-        "columns": columns,
-        "rows": rows,
-        "resolution_m": grid.resolution_m,
-        "origin_m": list(grid.origin_m),
-    }
+    data = {"columns": columns, "rows": rows}
+    data |= {"resolution_m": grid.resolution_m, "origin_m": list(grid.origin_m)}
     return Done(lines=str(grid).splitlines(), data=data, wrote=wrote)

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Gamepad, Lab, MapLayer, Network, Plant, Seed, Session
+from magtwin.cli.options import Folder, Force, Gamepad, Lab, MapLayer, Network, Plant, Seed, Session
 from magtwin.cli.runs.run import SHOWN, save_picture
-from magtwin.cli.terminal import Done, note, silence, step
+from magtwin.cli.terminal import Done, named, note, silence, step
 from magtwin.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ STATUS_HZ = 10.0
 def drive(
     scene: Path,
     *,
-    out: Path = Path("drive"),
+    out: Folder = Path("drive"),
     lab: Lab = "",
     map_layer: MapLayer = None,
     gamepad: Gamepad = None,
@@ -48,8 +48,6 @@ def drive(
     ----------
     scene
         USD stage to drive in, or the name of a scene that ships with magtwin: lab.
-    out
-        Folder to make.
     live
         Show the drive in a Rerun viewer while it goes on, if a window can be opened.
     """
@@ -57,7 +55,7 @@ def drive(
 
     from magtwin.files.file import existing
     from magtwin.files.kinds import scene_file
-    from magtwin.files.outputs import free, output
+    from magtwin.files.outputs import output
     from magtwin.io.outputs import Outputs
     from magtwin.io.outputs import drive as drive_again
     from magtwin.sim.motion.closed_loop import Chassis
@@ -73,11 +71,10 @@ def drive(
         if existing(gamepad, "gamepad").is_dir():
             raise InputError(f"{gamepad}: a folder; name a gamepad in it, such as /dev/input/js0")
         raise InputError(f"{gamepad}: not a gamepad; name one, such as /dev/input/js0")
-    (out,) = free(out, force=force)
+    out = named(out, force=force)
     with output(out, force=force) as folder:
-        twin = open_twin(scene, lab=lab, map_layer=map_layer, network=network)
-        twin = with_plant(twin, plant)
-        twin = in_session(twin, session, seed=seed)
+        opened: Any = {"lab": lab, "map_layer": map_layer, "network": network}
+        twin = in_session(with_plant(open_twin(scene, **opened), plant), session, seed=seed)
         robot, dt = twin.scene.robot, 1.0 / CONTROL_RATE_HZ
         errors = draw_wheel_errors(robot.drive, streams(np.random.default_rng(seed))["drive"])
         start: Any = {"start": twin.scene.start, "footprint_radius_m": robot.footprint_radius_m}
@@ -100,31 +97,16 @@ def drive(
                 _drive(recorder, hand, source, dt, show)
         folder.mkdir()
         write_commands(recorder.commands("commands.csv"), folder / "commands.csv")
-        driven = drive_again(
-            scene,
-            read_commands(folder / "commands.csv"),
-            lab=lab,
-            map_layer=map_layer,
-            network=network,
-            seed=seed,
-            session=session,
-            plant=plant,
-            metadata={"commands_file": "commands.csv"},
-            report=step,
-            tell=note,
-        )
+        opened |= {"seed": seed, "session": session, "plant": plant, "report": step, "tell": note}
+        named_file = {"commands_file": "commands.csv"}
+        driven = drive_again(scene, read_commands(folder / "commands.csv"), metadata=named_file, **opened)
         Outputs(folder, picture=save_picture).write(driven)
     again: list[object] = ["magtwin", "run", scene, "--path", out / "commands.csv", "--seed", seed]
     options = {"lab": lab or None, "map": map_layer, "session": session, "plant": plant}
     again += [word for name, value in options.items() if value is not None for word in (f"--{name}", value)]
     following = (("magtwin", "view", out / "run.rrd"), again)
-    return Done(
-        driven.run.report(f"Manual drive in {scene.stem}"),
-        out,
-        SHOWN,
-        rest=f"magtwin info {out}",
-        next=following,
-    )
+    told = driven.run.report(f"Manual drive in {scene.stem}")
+    return Done(told, out, SHOWN, rest=f"magtwin info {out}", next=following)
 
 
 def _drive(recorder: "Recorder", hand: "Hand", device: int, dt: float, show: object) -> None:

@@ -1,7 +1,7 @@
 """`magtwin info`, `view`, `convert` and `fetch`."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -15,7 +15,7 @@ from magtwin.cli.options import (
     UsdFps,
     reads_recordings,
 )
-from magtwin.cli.terminal import Done, progress, silence, step
+from magtwin.cli.terminal import Done, named, progress, silence, step
 
 
 @app.command
@@ -80,20 +80,12 @@ def convert(
         File to make: .parquet, .csv, .npz, .rrd, .mcap, .usd, .usda or .usdc. A name without a suffix is the
         folder of a rosbag2.
     """
-    from magtwin.files.outputs import free
     from magtwin.io.convert import convert_run
 
-    (out,) = free(out, force=force)
+    out = named(out, force=force)
     step("Converting the run")
-    result = convert_run(
-        run,
-        out,
-        scene=scene,
-        out_unit=out_unit,
-        usd_fps=usd_fps,
-        force=force,
-        **recorded.options,
-    )
+    how: Any = {"scene": scene, "out_unit": out_unit, "usd_fps": usd_fps, "force": force}
+    result = convert_run(run, out, **how, **recorded.options)
     rows = f"{result.rows:,} rows, {len(result)} columns, {result.duration_s:g} s"
     data = {"rows": result.rows, "columns": len(result), "duration_s": result.duration_s}
     look = "view" if out.suffix.lower() in (".rrd", ".usd", ".usda", ".usdc") else "report"
@@ -124,13 +116,12 @@ def fetch(
     """
     from magtwin.fetch import default_folder, is_complete
     from magtwin.fetch import fetch as fetch_files
-    from magtwin.files.outputs import free
 
     folder = out or default_folder(assets)
     if not force and is_complete(assets, folder):
         return Done(text=f"{folder}: all files are there already, as published", data={"wrote": []})
     if out is not None or assets != "isaac-rules":  # these are looked for in one place
-        (folder,) = free(folder, force=force)
+        folder = named(folder, force=force)
     with progress(f"Fetching {assets}", "files") as advance:
         files = fetch_files(assets, folder, base_url=base_url, force=force, progress=advance)
     return Done(wrote=folder, text=f"{len(files)} files")

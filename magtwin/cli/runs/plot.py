@@ -7,7 +7,7 @@ from cyclopts import Parameter
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force, RunScene, headings_rad, reads_recordings
-from magtwin.cli.terminal import Done, note, progress
+from magtwin.cli.terminal import Done, named, note, progress
 from magtwin.errors import InputError
 
 
@@ -60,9 +60,8 @@ def plot(
         Frames per second of a film [Hz]. Default: 25.
     """
     from magtwin.figures.drawing import draw
-    from magtwin.files.outputs import free
 
-    (out,) = free(out or Path(f"{files[0].stem}.png"), force=force)
+    out = named(out or Path(f"{files[0].stem}.png"), force=force)
     options: dict[str, Any] = {"at_s": at_s, "camera": camera, "scene": scene, "pace": pace, "fps": fps}
     options |= {"headings": headings_deg and headings_rad(headings_deg), "size": size and _size(size)}
     with progress(f"Drawing {files[0].name}", "frames") as advance:

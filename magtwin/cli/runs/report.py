@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, RunScene, reads_recordings
+from magtwin.cli.options import AnyRun, Force, RunScene, reads_recordings
 from magtwin.cli.terminal import Done, named, progress, step
 from magtwin.report.summary import aligned
 
@@ -48,7 +48,7 @@ def report(
 @app.command
 @reads_recordings
 def compare(
-    a: Path,
+    a: AnyRun,
     b: Path,
     *,
     align: Literal["time", "path", "none"] = "time",
@@ -59,8 +59,6 @@ def compare(
 
     Parameters
     ----------
-    a
-        A run in any format that magtwin reads.
     b
         The run to compare with it.
     align

@@ -12,6 +12,7 @@ from cyclopts import Parameter
 from magtwin.cli.app import app
 from magtwin.cli.options import (
     Flag,
+    Folder,
     Force,
     Lab,
     Magnetometer,
@@ -23,7 +24,7 @@ from magtwin.cli.options import (
     check_pace,
 )
 from magtwin.cli.settings import RUN, RunOptions, RunSettings
-from magtwin.cli.terminal import Done, note, progress, step
+from magtwin.cli.terminal import Done, named, note, progress, step
 from magtwin.errors import InputError, find
 
 if TYPE_CHECKING:
@@ -36,27 +37,22 @@ SHOWN = ("duration", "distance driven", "readings", "b_total_nt", "error")
 
 
 @app.command
-def demo(*, out: Path = Path("demo"), seed: Seed = 0, force: Force = False) -> Done:
+def demo(*, out: Folder = Path("demo"), seed: Seed = 0, force: Force = False) -> Done:
     """Author a lab and a TurtleBot 4, drive a figure of eight and log what the magnetometer reads.
 
     It writes the stages, run.html (plays the run in a browser), run.rrd (opens in Rerun), run.parquet and
     pictures, in less than a minute.
-
-    Parameters
-    ----------
-    out
-        Folder to make.
     """
     from magtwin.author.robot import build_robot
     from magtwin.author.scene import author_scene
     from magtwin.figures.pictures import picture_of_stage
     from magtwin.figures.reporting import report_runs
     from magtwin.files.file import shipped
-    from magtwin.files.outputs import free, output
+    from magtwin.files.outputs import output
     from magtwin.io.outputs import Outputs, drive
     from magtwin.twin import scene_from_toml
 
-    (out,) = free(out, force=force)
+    out = named(out, force=force)
     with output(out, force=force) as folder:
         step("Authoring the TurtleBot 4 from its URDF")
         source = shipped("robots", "turtlebot4")
@@ -141,18 +137,13 @@ def run(
         Show the run in a Rerun viewer, in step with the clock, once it is written. Ctrl-C ends it.
     """
     from magtwin.files.kinds import scene_file
-    from magtwin.io.outputs import Outputs, driven_by
+    from magtwin.io.outputs import Outputs, drive, driven_by
+    from magtwin.run.run import Run
     from magtwin.usd.scene import robots_in
 
     scene = scene_file(scene)
-    outputs = Outputs.of(
-        out or [Path("run")],
-        scans=scans,
-        force=force,
-        out_unit=settings.out_unit,
-        usd_fps=settings.usd_fps,
-        picture=save_picture,
-    )
+    formats: Any = {"scans": scans, "out_unit": settings.out_unit, "usd_fps": settings.usd_fps}
+    outputs = Outputs.of(out or [Path("run")], force=force, picture=save_picture, **formats)
     what = None if path is None else driven_by(path)
     options: dict[str, Any] = {"seed": seed, "session": session, "plant": plant, "speed": speed}
     options |= {"duration_s": duration_s, "network": network, "magnetometer": magnetometer, "fit": fit}
@@ -178,9 +169,17 @@ def run(
     if what is None:
         what = path = str(next(iter(robots.values())) or "figure8")
     step("Opening the scene")
-    driven = _run_one(scene, outputs, what, path, settings, live=live, engine=engine, **options)
-    title = f"{path} in {scene.stem}"
-    made, told = outputs.targets, driven.run.report(title)
+    how, unit = (" in Newton", "steps") if engine == "newton" else ("", "")
+    options["metadata"] = {"replay_file": Path(str(path)).as_posix()} if isinstance(what, Run) else {}
+    with outputs.kept() as keep, outputs.aside() as places:
+        with progress(f"Driving {path}{how}", unit) as advance:
+            options |= {"progress": advance, "each": keep, "report": step, "tell": note}
+            driven = drive(scene, what, engine=engine, **options)
+        step("Writing the run")
+        places.write(driven)
+    if live or settings.viewer:
+        _show(driven, settings.viewer, settings.pace or 1.0)
+    made, told = outputs.targets, driven.run.report(f"{path} in {scene.stem}")
     return Done(told, tuple(made), SHOWN, rest=f"magtwin info {made[0]}", next=look_at(made))
 
 
@@ -188,9 +187,8 @@ def look_at(written: list[Path]) -> list[tuple[object, ...]]:
     """What to type to see a run: its recording, and its page."""
     from magtwin.io.outputs import IN_FOLDER
 
-    files = [
-        file for out in written for file in ([out] if out.suffix else [out / name for name in IN_FOLDER])
-    ]
+    inside = [[out] if out.suffix else [out / name for name in IN_FOLDER] for out in written]
+    files = [file for each in inside for file in each]
     recording = next((file for file in files if file.suffix == ".rrd"), None)
     table = next((file for file in files if file.suffix != ".rrd"), files[0])
     shown: list[tuple[object, ...]] = [] if recording is None else [("magtwin", "view", recording)]
@@ -237,38 +235,6 @@ def _check(
         from magtwin.io.rerun.live import check_listens
 
         check_listens(settings.viewer)
-
-
-def _run_one(
-    scene: Path,
-    outputs: "Outputs",
-    what: Any,
-    path: str | None,
-    settings: RunSettings,
-    *,
-    live: bool,
-    engine: str,
-    **options: Any,
-) -> "Driven":
-    """Drive the only robot of a scene, show the run if asked for, and write it."""
-    from magtwin.io.outputs import drive
-    from magtwin.run.run import Run
-
-    newton = engine == "newton"
-    replayed = {"replay_file": Path(str(path)).as_posix()} if isinstance(what, Run) else {}
-    with ExitStack() as stack:
-        keep = stack.enter_context(outputs.kept())
-        places = stack.enter_context(outputs.aside())
-        with progress(
-            f"Driving {path}{' in Newton' if newton else ''}", "steps" if newton else ""
-        ) as advance:
-            options |= {"progress": advance, "each": keep, "report": step, "metadata": replayed}
-            driven = drive(scene, what, engine=engine, tell=note, **options)
-        step("Writing the run")
-        places.write(driven)
-    if live or settings.viewer:
-        _show(driven, settings.viewer, settings.pace or 1.0)
-    return driven
 
 
 def save_picture(driven: "Driven", out: Path, force: bool) -> None:
@@ -318,15 +284,8 @@ def _run_robots(
             aside = stack.enter_context(replace(own[name], folder=None).aside())
             places[name] = replace(aside, folder=folder)
         with progress(f"Driving {', '.join(ways)}") as advance:
-            runs = simulate_robots(
-                twin,
-                ways,
-                robots=names,
-                meet=meet,
-                progress=advance,
-                each=lambda name, block: kept[name](block),
-                **options,
-            )
+            options |= {"robots": names, "meet": meet, "each": lambda name, block: kept[name](block)}
+            runs = simulate_robots(twin, ways, progress=advance, **options)
         step("Writing the runs")
         for name, run in runs.items():
             its = led_by(twin, name)

@@ -1,11 +1,13 @@
 """`magtwin sweep`."""
 
 from pathlib import Path
+from typing import Any
 
 from magtwin.cli.app import app
 from magtwin.cli.options import (
     Dask,
     Flag,
+    Folder,
     Force,
     Jobs,
     Magnetometer,
@@ -19,7 +21,7 @@ from magtwin.cli.options import (
     Whole,
 )
 from magtwin.cli.settings import SWEEP, SweepOptions
-from magtwin.cli.terminal import Done, continued_by_a_repeat, progress, step
+from magtwin.cli.terminal import Done, continued_by_a_repeat, named, progress, step
 from magtwin.errors import InputError
 
 RUNS_A_SESSION = 5
@@ -30,7 +32,7 @@ RUNS_A_SESSION = 5
 def sweep(
     scene: Path,
     *,
-    out: Path = Path("runs"),
+    out: Folder = Path("runs"),
     count: Whole = 100,
     path: Names = None,
     fit: Flag = False,
@@ -63,8 +65,6 @@ def sweep(
     ----------
     scene
         USD stage to drive in, or the name of a scene that ships with magtwin: lab.
-    out
-        Folder to make.
     count
         Number of runs.
     path
@@ -82,7 +82,6 @@ def sweep(
         Number of processes. Default: one, with several threads.
     """
     from magtwin.files.kinds import scene_file
-    from magtwin.files.outputs import free
     from magtwin.io.outputs import driven_by
     from magtwin.parallel import parse_shard
     from magtwin.sim.motion.drive_input import drive_input
@@ -106,31 +105,16 @@ def sweep(
     for what in paths:
         drive_input(what)  # refuses a wrong name before the scene is opened
     part = None if shard is None else parse_shard(shard)
-    out = out if part else free(out, force=force)[0]  # shards share one folder
+    out = out if part else named(out, force=force)  # shards share one folder
     step("Opening the scene")
-    twin = open_twin(
-        scene,
-        lab=settings.lab,
-        map_layer=map_layer,
-        network=settings.network,
-        magnetometer=magnetometer,
-        model_error=settings.model_error,
-        tracking_error=settings.tracking_error,
-    )
-    runs = drive_many(
-        twin,
-        [drive_input(what, room_of(twin), fit=fit) for what in paths],
-        count,
-        seed=seed,
-        sessions=sessions or max(1, round(count / RUNS_A_SESSION)),
-        plant=plant,
-        speeds=speed if speed is not None else 0.2 if sessions == "survey" else "drawn",
-        columns=settings.keep,
-        duration_s=duration_s,
-        rate_hz=rate_hz,
-        lidar=settings.lidar,
-        outside=settings.outside,
-    )
+    opened = {name: getattr(settings, name) for name in ("lab", "network", "model_error", "tracking_error")}
+    twin = open_twin(scene, map_layer=map_layer, magnetometer=magnetometer, **opened)
+    ways = [drive_input(what, room_of(twin), fit=fit) for what in paths]
+    how: Any = {"seed": seed, "plant": plant, "duration_s": duration_s, "rate_hz": rate_hz}
+    how |= {"columns": settings.keep, "lidar": settings.lidar, "outside": settings.outside}
+    how["sessions"] = sessions or max(1, round(count / RUNS_A_SESSION))
+    how["speeds"] = speed if speed is not None else 0.2 if sessions == "survey" else "drawn"
+    runs = drive_many(twin, ways, count, **how)
     kept = jobs is not None or part is not None or dask is not None
     with continued_by_a_repeat(when=kept), progress("Driving", "runs") as advance:
         made = runs.save(out, force=force, jobs=jobs, shard=part, dask=dask, progress=advance)

@@ -1,11 +1,12 @@
 """`magtwin export`."""
 
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force
-from magtwin.cli.terminal import Done, step
+from magtwin.cli.terminal import Done, named, step
 from magtwin.errors import InputError
 
 
@@ -43,7 +44,6 @@ def export(
     from magtwin.export.package import export_scene
     from magtwin.files.file import existing
     from magtwin.files.kinds import scene_file
-    from magtwin.files.outputs import free
 
     stage = scene_file(scene)
     if out.suffix.lower() == ".html":
@@ -51,12 +51,12 @@ def export(
 
         if target is not None:
             raise InputError("a page is for browsers; leave out --target")
-        (out,) = free(out, force=force)
+        out = named(out, force=force)
         if run is None:
             return Done(wrote=report_scene(stage, out, force=force))
         report_runs([existing(run, "run")], out, scene=stage, force=force)
         return Done(wrote=out)
-    (out,) = free(out, beside=("_magtwin",) if out.suffix.lower() == ".usdz" else (), force=force)
+    out = named(out, beside=("_magtwin",) if out.suffix.lower() == ".usdz" else (), force=force)
     if target == "gazebo" or (target is None and out.suffix.lower() == ".sdf"):
         from magtwin.export.gazebo import export_world
 
@@ -68,16 +68,10 @@ def export(
         from magtwin.io.formats import read_run
 
         animation = read_run(existing(run, "run"))
-    made = export_scene(
-        stage,
-        out,
-        profile=target,
-        animation=animation,
-        to_onnx=_write_onnx if onnx and _has_onnx() else None,
-        thumbnail=_draw if thumbnail and target != "viewer" else None,
-        force=force,
-        progress=step,
-    )
+    how: Any = {"profile": target, "animation": animation, "force": force, "progress": step}
+    how["to_onnx"] = _write_onnx if onnx and find_spec("onnx") and find_spec("onnxruntime") else None
+    how["thumbnail"] = _draw if thumbnail and target != "viewer" else None
+    made = export_scene(stage, out, **how)
     check = ("magtwin", "validate", made.root)
     return Done(made.report(), tuple(made.files), next=() if out.suffix.lower() == ".glb" else (check,))
 
@@ -86,12 +80,6 @@ def _write_onnx(weights: Path, out: Path) -> None:
     from magtwin.learn.inference.onnx import export_onnx
 
     export_onnx(weights, out)
-
-
-def _has_onnx() -> bool:
-    from importlib.util import find_spec
-
-    return bool(find_spec("onnx") and find_spec("onnxruntime"))
 
 
 def _draw(stage: Path, out: Path) -> None:

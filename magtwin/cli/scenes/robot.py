@@ -69,14 +69,13 @@ def robot(
         Full report to write (.json).
     """
     given = dict(locals())
-    from magtwin.files.outputs import free, output, transaction
+    from magtwin.files.outputs import output, transaction
 
     if out.suffix.lower() in (".usd", ".usdc", ".usdz"):
-        raise InputError(
-            f"{out}: a robot is a folder, or one file .usda; give {out.stem}, or {out.stem}.usda"
-        )
+        give = f"give {out.stem}, or {out.stem}.usda"
+        raise InputError(f"{out}: a robot is a folder, or one file .usda; {give}")
     beside = {".usda": ("_meshes.usdc", "_textures"), ".urdf": ("_meshes",)}.get(out.suffix.lower(), ())
-    (out,) = free(out, beside=beside, force=force)
+    out = named(out, beside=beside, force=force)
     if out.suffix.lower() == ".urdf":
         from magtwin.author.from_urdf import write_urdf
 
@@ -102,14 +101,9 @@ def robot(
     }
     step("Converting the robot")
     with transaction(), output(report, force=force) if report is not None else nullcontext() as aside:
-        made = from_urdf(
-            urdf,
-            out,
-            settings=settings,
-            force=force,
-            thumbnail=_thumbnail if thumbnail else None,
-            **{name: choice for name, choice in choices.items() if choice is not None},
-        )
+        chosen = {name: choice for name, choice in choices.items() if choice is not None}
+        picture = _thumbnail if thumbnail else None
+        made = from_urdf(urdf, out, settings=settings, force=force, thumbnail=picture, **chosen)
         if aside is not None:
             aside.write_text(made.report.to_json(), encoding="utf-8")
     summary = made.report.summary()

@@ -100,14 +100,14 @@ def scene(
         them is refused, and the difference is given in nT.
     """
     from magtwin.author.scene import author_scene
-    from magtwin.files.outputs import free, not_read
+    from magtwin.files.outputs import not_read
     from magtwin.twin import scene_from_toml, scene_with_robot
     from magtwin.usd.info import info_of_stage
     from magtwin.usd.robot import read_notes
 
     if spec is not None and not Path(spec).is_file():
         not_read(spec)
-    (out,) = free(out, force=force)
+    out = named(out, force=force)
     lines: list[str] = []
     with TemporaryDirectory() as workshop:
         with progress("Reading the scene", "headings") as advance:
@@ -145,15 +145,11 @@ def _keys_for_flags() -> Iterator[None]:
     except InputError as error:
         packages = r'packages = {\1 = "FOLDER"} below [robot.conversion]'
         told = re.sub(r"--package (\S+)=FOLDER", packages, str(error))
-        raise InputError(
-            re.sub("`skip_missing_includes[^`]*`", "skip_missing_includes = true", told)
-        ) from error
+        told = re.sub("`skip_missing_includes[^`]*`", "skip_missing_includes = true", told)
+        raise InputError(told) from error
 
 
 def _check_unused(**options: object) -> None:
     """Refuse options that only matter with --urdf."""
-    used = [f"--{name}" for name, value in options.items() if value is not None]
-    if used:
-        raise InputError(
-            f"{', '.join(used)} goes with --urdf; a TOML has keys for these below [robot.conversion]"
-        )
+    if used := ", ".join(f"--{name}" for name, value in options.items() if value is not None):
+        raise InputError(f"{used} goes with --urdf; a TOML has keys for these below [robot.conversion]")

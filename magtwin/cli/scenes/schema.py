@@ -4,7 +4,7 @@ from pathlib import Path
 
 from magtwin.cli.app import app
 from magtwin.cli.options import Force
-from magtwin.cli.terminal import Done
+from magtwin.cli.terminal import Done, named
 
 
 @app.command
@@ -22,8 +22,6 @@ def schema(*, out: Path | None = None, toml: Path | None = None, force: Force = 
         Folder for the JSON schemas of scenes, sources, robots, suites and trainings. A TOML with the first
         line `#:schema ./scene.schema.json` is completed and checked by editors that know TOML schemas.
     """
-    from magtwin.files.outputs import free
-
     if toml is not None:
         from magtwin.files.settings import copy_schemas
 
@@ -34,6 +32,6 @@ def schema(*, out: Path | None = None, toml: Path | None = None, force: Force = 
 
     if out is None:
         return Done(text=str(FOLDER), data={"version": TEXT, "folder": str(FOLDER)})
-    (out,) = free(out, force=force)
+    out = named(out, force=force)
     publish(out, force=force)
     return Done(wrote=out, data={"version": TEXT, "folder": str(out)})
