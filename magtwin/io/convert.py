@@ -66,14 +66,9 @@ def twin_to_show(
 ) -> Twin | None:
     """The scene to show a run in. Warns, and returns None, if the run's own scene cannot be opened.
 
-    Args:
-        run: The run.
-        file: File of the run; its folder is searched for the scene.
-        scene: Scene to use in place of the one of the metadata. `file`: the scene that the run plays over.
-        lacks: What the warning says is missing.
-
-    Raises:
-        InputError: Another `scene` was given and cannot be opened.
+    The folder of its `file` is searched for the scene. `scene` is used in place of that of the metadata, and
+    must open unless it is `file`, as for a run that plays over a scene. The warning says what is lacking in
+    `lacks`.
     """
     try:
         stage = scene_of(run, scene, near=file)

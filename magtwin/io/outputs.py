@@ -177,11 +177,7 @@ class Outputs:
         return made
 
     def free(self, robots: Iterable[str] = ()) -> "Outputs":
-        """The outputs by names that nothing has yet; see `magtwin.files.outputs.free`.
-
-        Args:
-            robots: Names of the robots, where several are written, each to files of its own.
-        """
+        """The outputs by names that nothing has yet, also for each of several robots by their names."""
         named, kinds = [*([self.folder] if self.folder else []), *self.files], {f.suffix for f in self.files}
         scans = [".scans.parquet"] if self.scans else []
         ends = [*scans, f"{named[0].suffix}.parts"]

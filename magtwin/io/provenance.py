@@ -90,11 +90,7 @@ class Repeat:
 
 
 def repeat_of(file: str | FilePath, scene: str | FilePath | None = None) -> Repeat:
-    """Reproduce the run of a file, and compare it at the precision of the file's format.
-
-    Raises:
-        InputError: The file holds no run; or as for `repeat`.
-    """
+    """Reproduce the run of a file as `repeat`, and compare it at the precision of the file's format."""
     file = FilePath(file)
     run = read_run(file)
     result = repeat(run, scene, near=file)
@@ -140,16 +136,8 @@ def made_again(
 ) -> Run:
     """Reproduce a run from its metadata, or drive the same with another engine or seed.
 
-    Args:
-        run: As for `repeat`.
-        scene: As for `repeat`.
-        near: As for `repeat`.
-        engine: "kinematic" or "newton". Default: the run's engine.
-        seed: Seed of all noise. Default: the run's seed.
-        progress: As for `magtwin.twin.engine_named`.
-
-    Raises:
-        InputError: As for `repeat`; or the engine is unknown or not installed.
+    Arguments are those of `repeat`; `engine` is "kinematic" or "newton", by default that of the run, as is
+    the seed of all noise; `progress` is that of `magtwin.twin.engine_named`.
     """
     metadata = run.metadata
     if "seed" not in metadata and seed is None:
@@ -186,16 +174,7 @@ def made_again(
 def map_of(
     run: Run, scene: str | FilePath | None = None, *, near: str | FilePath | None = None
 ) -> AnomalyMap:
-    """The map of a run, if its scene is available and the map is unchanged.
-
-    Args:
-        run: The run.
-        scene: As for `repeat`.
-        near: As for `repeat`.
-
-    Raises:
-        InputError: The scene is missing, or its map changed.
-    """
+    """The map of a run, if its scene is there and the map unchanged; arguments are those of `repeat`."""
     from magtwin.usd.layers import layer_sha256
     from magtwin.usd.maps.layer import load_map
     from magtwin.usd.scene import read_scene

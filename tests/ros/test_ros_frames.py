@@ -69,7 +69,7 @@ def pose(header: str, child: str, p: Any = PLACE, q: Rotation = HEADING) -> dict
 def test_the_pose_of_a_camera_is_refused_until_its_place_is_known_and_then_that_of_the_base() -> None:
     bus, one, lines = heard(POSE, ODOMETRY_KIND)
     there, turned = PLACE + HEADING.apply(ARM), HEADING * MOUNT
-    fault = "it is the pose of 'camera_link', and no /tf_static has the way from base_link to there: "
+    fault = "it is the pose of 'camera_link', and no tree of frames has the way from base_link to there: "
     fault += "publish that transform, or the pose of base_link"
     for _ in range(3):
         bus.send(POSE.name, pose("map", "camera_link", there, turned))

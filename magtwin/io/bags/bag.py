@@ -71,10 +71,10 @@ class Bag:
                 opened.callback(reader.close)
                 self.readers.append(reader)
                 self._take(reader, about.kinds)
+            if not (all(reader.whole for reader in self.readers) or PARTIAL in self.path.name):
+                text = "cut short: its end is missing; it is read up to its last whole chunk"
+                warnings.warn(f"{self.path}: {text}", RepairWarning, stacklevel=2)
             self._opened = opened.pop_all()
-        if not (all(reader.whole for reader in self.readers) or PARTIAL in self.path.name):
-            text = "cut short: its end is missing; it is read up to its last whole chunk"
-            warnings.warn(f"{self.path}: {text}", RepairWarning, stacklevel=2)
         self._tell()
 
     def _take(self, reader: "McapReader | Db3Reader | Ros1Reader", kinds: Mapping[str, str]) -> None:

@@ -51,19 +51,8 @@ def write_rrd(
 
     Every column is stored exactly and at full rate on the timeline `sim_time`; poses are drawn at 50 Hz at
     most. The recording's id comes from the run's content, so two files of one run hold the same recording.
-    Only Rerun's own ids of chunks, rows and views differ, which `rerun rrd compare --unordered` ignores.
-
-    Args:
-        run: The run.
-        path: The .rrd file to make.
-        twin: Where the run took place: its stage and its map are shown. None: only series.
-        planned: The planned path, or None.
-        scans: LiDAR scans, drawn as points in world, or None.
-        force: Whether to replace an existing file.
-
-    Raises:
-        InputError: The file exists and `force` was not given or it cannot be written, the stage cannot be
-            read, or the run has no rows.
+    Only Rerun's own ids of chunks, rows and views differ, which `rerun rrd compare --unordered` ignores. With
+    the `twin`, its stage and map are shown, with the `planned` path and the LiDAR's `scans`.
     """
     _check_rows(run, path)
     name, size = title_of(run) or FilePath(path).stem, size_of(run, scans)
@@ -94,19 +83,7 @@ def write_comparison(
     planned: Path | None = None,
     force: bool = False,
 ) -> None:
-    """Write several runs into one recording, on a common timeline, each in its own colour.
-
-    Args:
-        runs: The runs by name.
-        path: The .rrd file to make.
-        twin: Where they took place. None: only series.
-        planned: The planned path, or None.
-        force: Whether to replace an existing file.
-
-    Raises:
-        InputError: There is no run or one has no rows, two names are the same to Rerun, or the file cannot be
-            made as in `write_rrd`.
-    """
+    """Write several runs by name into one recording, on a common timeline, each in its own colour."""
     if not runs:
         raise InputError(f"{path}: there are no runs to compare; name at least one")
     for run in runs.values():
@@ -142,13 +119,7 @@ def write_comparison(
 def show_run(run: Run, twin: Twin | None = None, *, file: str | os.PathLike[str]) -> None:
     """Show a run in the Rerun viewer; returns when the viewer is closed.
 
-    Args:
-        run: The run.
-        twin: Where it took place. None: only series.
-        file: The file that the run was read from; errors and the window name it.
-
-    Raises:
-        InputError: The run has no rows or, without a twin, nothing to plot; or the viewer cannot run here.
+    Without the twin, only series are shown. Errors and the window name `file`, from which the run was read.
     """
     _check_rows(run, file)
     if twin is None and not plotted(run):
@@ -160,14 +131,7 @@ def show_run(run: Run, twin: Twin | None = None, *, file: str | os.PathLike[str]
 
 
 def read_run(path: str | os.PathLike[str]) -> Run:
-    """The run of a recording, equal to the written one to the bit.
-
-    Args:
-        path: The .rrd file.
-
-    Raises:
-        InputError: The file is missing, is not a recording, was cut short, or holds no run or several.
-    """
+    """The run of a recording, equal to the written one to the bit; refused if it holds none, or several."""
     runs = read_runs(path)
     if len(runs) > 1:
         raise InputError(
@@ -178,14 +142,7 @@ def read_run(path: str | os.PathLike[str]) -> Run:
 
 
 def read_runs(path: str | os.PathLike[str]) -> dict[str, Run]:
-    """The runs of a recording by name; a single run is called "run".
-
-    Args:
-        path: The .rrd file.
-
-    Raises:
-        InputError: As for `read_run`.
-    """
+    """The runs of a recording by name; a single run is called "run"."""
     path = existing(path, "recording")
     if path.is_dir():
         raise InputError(f"{path}: a folder; name the .rrd file in it")

@@ -161,11 +161,8 @@ def layout(
 ) -> rrb.Blueprint:
     """The views of a run: plots, states and events, and with a lab also the lab and the robot in 3D.
 
-    Args:
-        run: The run.
-        lab: The lab. None: no 3D views.
-        heading: Heading of the map on the floor [rad], for the title.
-        events: Flags that get a lane of states. Default: those that the run raised.
+    `heading` is that of the map on the floor [rad], for the title; `events` are flags that get a lane of
+    states, by default those that the run raised.
     """
     shown = Shown.of(run)
     axis = _whole([shown])
@@ -195,10 +192,7 @@ def layout(
 def comparison_layout(
     runs: Sequence[Shown], lab: LabSpec | None = None, *, heading: float = 0.0
 ) -> rrb.Blueprint:
-    """The views of several runs on a common timeline, each in its own colour.
-
-    Without a lab there are no 3D views; `heading` is that of the map on the floor [rad], for the title.
-    """
+    """The views of several runs on a common timeline; `heading` is that of the map on the floor [rad]."""
     plots = {
         title: [(shown, Series(column, shown.name, shown.colour, part)) for shown in runs]
         for title, column, part in _COMPARED
@@ -306,10 +300,7 @@ def _titled(title: str, lines: Sequence[tuple[str, Colour]]) -> str:
 
 
 def value_range(values: Array) -> tuple[float, float] | None:
-    """Ends of an axis with room beyond the values and beyond every tick, so that no label is cut.
-
-    nan is ignored. None for values that do not vary, where the viewer's default is as good.
-    """
+    """Ends of an axis with room beyond the values and every tick; nan is ignored. None if all are alike."""
     known = values[np.isfinite(values)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     if high - low <= 1e-9 * max(abs(low), abs(high)):
@@ -323,10 +314,7 @@ def value_range(values: Array) -> tuple[float, float] | None:
 
 
 def lab_eye(lab: LabSpec) -> tuple[Vec3, Vec3]:
-    """Position and target of an eye that sees a whole lab, in world [m].
-
-    The eye is above the near edge of the floor, inside the capture frame, so that no rail crosses the floor.
-    """
+    """Position and target of an eye above the near edge of the floor that sees a whole lab, in world [m]."""
     x0, x1, y0, y1 = lab.extent_m
     x, y, at_x, at_y = x1 - x0, y1 - y0, (x0 + x1) / 2, (y0 + y1) / 2
     height = max(0.9 * max(x, 1.7 * y), 1.5 * lab.post_height_m)

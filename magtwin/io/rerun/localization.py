@@ -49,21 +49,10 @@ def write_localization(
 ) -> None:
     """Write a localized run as a recording: the map from above with the poses, and errors against time.
 
-    The columns of the run are stored as by `magtwin.io.rerun.file.write_rrd`, and can be read back.
-
-    Args:
-        run: A run with the columns of `magtwin.localization.track.EST_COLUMNS`.
-        path: The .rrd file to make.
-        anomaly_map: The map, drawn below the paths.
-        truth: True x, y [m] and yaw [rad], shape (N, 3).
-        dead_reckoning: The same by dead reckoning.
-        bound_m: Least standard deviation of the position [m], shape (N,).
-        particles: Samples at each reading, shapes (P, 4): x, y, yaw, weight; () to draw ellipses instead.
-        force: Whether to replace an existing file.
-
-    Raises:
-        InputError: The run has no rows or no estimates; or the file exists and `force` was not given, or it
-            cannot be written.
+    The columns of the run, which has those of `magtwin.localization.track.EST_COLUMNS`, are stored as by
+    `magtwin.io.rerun.file.write_rrd`, and can be read back. `truth` and `dead_reckoning` are x, y [m] and yaw
+    [rad], shape (N, 3); `bound_m` is the least standard deviation of the position [m], shape (N,);
+    `particles` are samples at each reading, shapes (P, 4): x, y, yaw, weight, or () to draw ellipses.
     """
     if not run.rows or "est_p_world_base" not in run:
         raise InputError(f"{path}: the run has no estimates to record; run `magtwin localize` on it first")

@@ -57,15 +57,10 @@ POSED = frozenset(("p_world_base", "q_world_base_xyzw"))
 
 
 def check_room(file: FilePath, size: int, final: FilePath | None = None) -> None:
-    """Refuse a recording for which the disk has no room.
+    """Refuse a recording of up to `size` bytes for which the disk has no room; errors name `final`.
 
-    Rerun writes from its own thread, and waits for that thread for ever after a full disk ended it. So the
-    room is checked first.
-
-    `size` is an upper bound of the file's size [bytes]; errors name `final`.
-
-    Raises:
-        InputError: There is no room, or its folder cannot be written.
+    Rerun writes from its own thread, and waits for it for ever after a full disk ended it. So this comes
+    first.
     """
     try:
         with tempfile.TemporaryFile(dir=file.parent) as probe:
@@ -106,9 +101,6 @@ def stream(
     The viewer merges recordings of one `recording_id`. `views` is the layout that it opens with, `final` the
     file that errors name, and `room` an upper bound of the file's size [bytes]. The file can be read at any
     time up to the last flush.
-
-    Raises:
-        InputError: Rerun is switched off, or the file cannot be written.
     """
     final = final or file
     if file is not None:
@@ -156,11 +148,7 @@ def _open(rec: rr.RecordingStream, sink: Any, views: rrb.Blueprint) -> None:
 
 
 def flush(rec: rr.RecordingStream, folder: FilePath | None) -> None:
-    """Wait until the data of a stream is written.
-
-    Raises:
-        RuntimeError: It cannot be written.
-    """
+    """Wait until the data of a stream is written; RuntimeError if it cannot be."""
     await_rerun(lambda: rec.flush(timeout_sec=PATIENCE_S), folder)
 
 
@@ -168,10 +156,7 @@ def await_rerun(work: Callable[[], object], folder: FilePath | None) -> None:
     """Call a function of Rerun that waits for its writing thread, which a full disk has ended.
 
     Rerun then waits for ever. So it works in a thread, while this one looks whether the disk of `folder` is
-    full. No folder: it is called as it is.
-
-    Raises:
-        RuntimeError: It fails, or has not ended after `PATIENCE_S`.
+    full. It is a RuntimeError if it fails, or has not ended after `PATIENCE_S`.
     """
     if folder is None:
         work()
@@ -279,9 +264,6 @@ def recording_of(
     `known` sets axes and colours; default: `run`. No twin: only series. `room` is an upper bound of the size
     of the rows [bytes]; a `rate_hz` of 0 is taken from the first rows; `sinks` are `file`, `address` and
     `final` of `stream`.
-
-    Raises:
-        InputError: The stage cannot be read, or as for `stream`.
     """
     known = run if known is None else known
     lab, heading = (None, 0.0) if twin is None else (twin.scene.lab, heading_of(twin.field, known))

@@ -127,10 +127,7 @@ def derived(run: Run) -> dict[str, Array]:
 
 
 def entity_of(entity: str, name: str) -> str:
-    """The entity of one run among several, by its name; `entity` itself for a single run.
-
-    Characters other than letters, digits, _ and - would need an escape in an entity path; they become _.
-    """
+    """The entity of one of several runs, by its name with _ for signs; `entity` for a single run."""
     plain = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in name)
     return f"{entity}/{plain}" if plain else entity
 
@@ -197,13 +194,7 @@ def _arrow(name: str, values: NDArray[Any], parts: tuple[str, ...]) -> pa.Array:
 
 
 def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | None]:
-    """The run in the chunks of its entity: its name, the run, and its number of rows if it is complete.
-
-    `chunks` are all chunks of the entity, in any order; `what` names the file in errors.
-
-    Raises:
-        InputError: The chunks hold no run.
-    """
+    """The run in all chunks of its entity: its name, the run, and its number of rows if it is complete."""
     static: dict[str, Any] = {}
     tables = []
     for batch in chunks:

@@ -65,12 +65,7 @@ TOASTS_S, NOTHING_S = 6.0, 10.0
 def show(rrd: str | os.PathLike[str], *, source: str | os.PathLike[str] | None = None) -> None:
     """Show a recording in a window; returns when the window is closed.
 
-    Args:
-        rrd: The recording.
-        source: The file that errors name, if `rrd` is a temporary recording of it. Default: `rrd`.
-
-    Raises:
-        InputError: The file is missing, or the viewer cannot run here.
+    Errors name `source`, if `rrd` is a temporary recording of it. They tell why the viewer cannot run here.
     """
     rrd = existing(rrd, "recording")
     command = [_binary(), "--bind", LOCALHOST, "--port", "auto", str(rrd)]
@@ -95,19 +90,9 @@ def screenshot(
 ) -> list[str]:
     """Draw a recording as the viewer shows it, with or without a display.
 
-    Args:
-        rrd: The recording.
-        png: The picture to make.
-        time_s: Time on the timeline `sim_time` [s]. Default: where the viewer starts.
-        size: Width and height of the picture [pixels].
-        force: Whether to replace an existing picture.
-
-    Returns:
-        The warnings and errors of the recording's views, one line each; empty if there are none.
-
-    Raises:
-        InputError: The recording is missing, cannot be read or has no such moment; the size is out of
-            range; the picture exists; or the machine has no Vulkan.
+    `time_s` is on the timeline `sim_time` [s], by default where the viewer starts; `size` is that of the
+    picture [pixels]. Returns the warnings and errors of the recording's views, one line each. Refused are a
+    recording that cannot be read or has no such moment, a size out of range, and a machine without Vulkan.
     """
     path = existing(rrd, "recording")
     if path.is_dir():
@@ -163,17 +148,10 @@ def _draw(
 def live_viewer(
     *, headless: bool = False, size: tuple[int, int] = (1600, 1000)
 ) -> Iterator[tuple[str, ViewerClient]]:
-    """A viewer that listens on localhost only; ended with the block.
+    """A viewer that listens on localhost only, ended with the block: its address, and a client.
 
-    Args:
-        headless: Whether it has no window, and only draws pictures.
-        size: Width and height of these pictures [pixels].
-
-    Yields:
-        The address that recordings connect to, and a client.
-
-    Raises:
-        InputError: It cannot run here; the text has its reason.
+    A `headless` one has no window, and only draws pictures of a size [pixels]. If it cannot run here, the
+    error tells its reason.
     """
     with socket.socket() as probe:
         probe.bind((LOCALHOST, 0))
@@ -245,10 +223,7 @@ def _interrupt_later() -> Iterator[list[int]]:
 def _connected(
     process: "subprocess.Popen[bytes]", port: int, log: IO[str], interrupts: list[int], *, draws: bool
 ) -> ViewerClient | None:
-    """A client of a started viewer, once it answers, or has drawn. It answers before it tries to draw.
-
-    None if the user interrupted.
-    """
+    """A client of a started viewer, once it answers, or has drawn; None if the user interrupted."""
     clients: list[ViewerClient] = []
 
     def ready() -> bool:
@@ -287,13 +262,10 @@ def _ending(process: "subprocess.Popen[bytes]", log: IO[str]) -> InputError:
 
 
 def check_decodes(rrd: Path, source: str | os.PathLike[str]) -> None:
-    """Refuse a recording that Rerun's own verifier cannot decode.
+    """Refuse a recording that Rerun's own verifier cannot decode; errors name `source`.
 
     The verifier is a separate process, as changed bytes may make Rerun's decoder end its process. A missing
-    end is accepted: a recording that still grows has none. Errors name `source`.
-
-    Raises:
-        InputError: It is not a recording, was cut short, or its bytes were changed.
+    end is accepted: a recording that still grows has none.
     """
     with rrd.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:

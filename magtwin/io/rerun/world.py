@@ -95,11 +95,7 @@ class Interior:
 
     @classmethod
     def of(cls, twin: Twin) -> "Interior":
-        """The lab and the first robot of a twin.
-
-        Raises:
-            InputError: The stage cannot be read.
-        """
+        """The lab and the first robot of a twin."""
         shapes, links = geometry(twin)
         return cls(twin.scene.robot, shapes, links)
 
@@ -333,11 +329,7 @@ class Robot:
                 send(rec, entity, t[known], rr.Arrows3D, vectors=arrows, origins=-arrows / 2)
 
     def _send_vector_style(self) -> None:
-        """Pose and style of the field arrow, in sensor axes.
-
-        The sensor is in the middle of the arrow, so half of the arrow is outside the robot however the field
-        dips. Its pose is relative to the robot, as the sensor's link may have no shape and so no entity.
-        """
+        """Pose and style of the field arrow in sensor axes, with its middle at the sensor."""
         entity = f"{entity_of('world/robot', self.name)}/magnetometer"
         robot = self.interior.robot
         place = _transform(robot.p_base_magnetometer, robot.q_base_magnetometer_xyzw)
