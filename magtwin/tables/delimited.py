@@ -115,24 +115,18 @@ def read_delimited(
 ) -> Delimited:
     """Read a text file of rows whose words are separated by commas, semicolons, tabs or blanks.
 
-    The text is UTF-8, UTF-16, or cp1252, which older spreadsheets write. The header is the
-    first line if any of its words is not a number, else the last comment line above the rows with as many
-    words as they have. These are skipped: other lines that begin with `#`, such as `# KEY: VALUE`; those that
-    begin with `/` if the first line does; empty lines; a first line `sep=;`; lines of prose above the header
-    and one below the rows; headers that are repeated; and the lines `Line 10` and `Tie 3` of Geosoft. The
-    units in a row below the header are added to the names, as in `x [cm]`. A decimal comma is read unless
-    commas separate the words or other numbers have decimal points. Marks between thousands are read if all
-    numbers of the column fit. If the last line has no end, it is left out if it has fewer words than others;
-    its last number is missing if it is far below all others of its column.
+    The text is UTF-8, UTF-16, or cp1252, which older spreadsheets write. The header is the first line if any
+    of its words is not a number, else the last comment line above the rows with as many words as they have.
+    These are skipped: other lines that begin with `#`, such as `# KEY: VALUE`; those that begin with `/` if
+    the first line does; empty lines; a first line `sep=;`; lines of prose above the header and one below the
+    rows; headers that are repeated; and the lines `Line 10` and `Tie 3` of Geosoft. The units in a row below
+    the header are added to the names, as in `x [cm]`. A decimal comma is read unless commas separate the
+    words or other numbers have decimal points. Marks between thousands are read if all numbers of the column
+    fit. If the last line has no end, it is left out if it has fewer words than others; its last number is
+    missing if it is far below all others of its column.
 
-    Args:
-        path: The file.
-        noun: What it is, for error messages.
-        wanted: What a row holds, for error messages ("one row of numbers per reading").
-        content: The bytes of the file, if it lies in an archive.
-
-    Raises:
-        InputError: The file is missing, not text, or empty, or its lines are too long or of different widths.
+    Errors tell its `noun` and what a row holds, which is `wanted` ("one row of numbers per reading").
+    `content` are the bytes of a file that lies in an archive.
     """
     if content is None:
         path = existing(path, noun)
@@ -351,10 +345,9 @@ def _lines(path: Path, text: str) -> tuple[_Lines, bool]:
 
 
 def _separator(lines: _Lines) -> tuple[str | None, int]:
-    """What stands between the words of lines, and the number of lines of prose above the header.
+    """What stands between the words of lines (None: blanks), and the number of lines of prose above.
 
-    It is the mark that each line has as often, from the header on; None for blanks. The last line of a short
-    file may differ.
+    It is the mark that each line has as often, from the header on; the last line of a short file may differ.
     """
     begun = [line for _, line in lines[:LOOKED]]
     found = _mark(begun) or (_mark(begun[:-1]) if 2 < len(lines) <= LOOKED else None)
@@ -433,7 +426,7 @@ def _without_begun(number: int, rows: list[list[str]], notes: list[str]) -> None
 def _without_thousands(rows: list[list[str]]) -> list[int]:
     """Take the marks between thousands out of the columns all of whose numbers fit; returns these columns.
 
-    A comma may be a decimal one. It is between thousands if a number has a point after it, or two of them.
+    A comma is between thousands if a number has a point after it, or two of them; else it may be decimal.
     """
     found = {
         k: match["mark"]

@@ -37,19 +37,9 @@ LONGEST_LINE = 2000
 class Bag:
     """An open bag: all of its storage files as one. What is damaged in it is left out, with a warning.
 
-    Args:
-        path: Folder of a rosbag2, or a storage file (.mcap, .db3, or .bag of ROS 1). A truncated file is read
-            up to its last whole chunk.
-
-    Attributes:
-        path: As given.
-        files: Its storage files.
-        topics: Its topics by name.
-        kinds: Message type of each topic; "" if it is not known.
-        packed: How rosbag2 compressed it: "file", "message" or "".
-
-    Raises:
-        InputError: There is no bag, or nothing of it can be read.
+    It is the folder of a rosbag2, or a storage file (.mcap, .db3, or .bag of ROS 1). A truncated file is read
+    up to its last whole chunk. `kinds` are the message types of its `topics`, "" if not known; `packed` tells
+    how rosbag2 compressed it: "file", "message" or "".
     """
 
     def __init__(self, path: Path) -> None:
@@ -152,11 +142,7 @@ class Bag:
         return {topic: np.sort(np.concatenate(parts)) for topic, parts in found.items()}
 
     def layout(self, name: str, counts: Mapping[str, Any] | None = None) -> tuple[Leaf, ...]:
-        """The leaves of a topic's type, as `magtwin.io.bags.types.layout`.
-
-        Raises:
-            InputError: The type is not known, nor defined in the bag.
-        """
+        """The leaves of a topic's type, as `magtwin.io.bags.types.layout`, which the bag may define."""
         return self.types.layout(self.kinds[name], counts, ros1=self.topics[name].encoding == "ros1")
 
     def missing(self, name: str) -> InputError:

@@ -83,14 +83,10 @@ class Messages:
 
 
 def encode(leaves: Sequence[Leaf], fields: Mapping[str, Any], rows: int, *, room: int = 0) -> Bytes:
-    """Messages of equal size, one per row, shape (rows, room + size).
+    """Messages of equal size, one per row, shape (rows, room + size); `room` bytes of each are left free.
 
-    Args:
-        leaves: Leaves of the type.
-        fields: Values by leaf name: an array of `rows` rows, or one value for all rows; stamps as int64 [ns];
-            a string or a sequence of strings for all rows. Default: zero or empty.
-        rows: Number of messages.
-        room: Bytes left free at the beginning of each row.
+    `fields` are values by leaf name: an array of `rows` rows, or one value for all rows; stamps as int64
+    [ns]; a string or a sequence of strings for all rows. Default: zero or empty.
     """
     numbers: list[tuple[int, str, NDArray[Any]]] = []
     texts: list[tuple[int, bytes]] = []
@@ -146,19 +142,11 @@ def encode(leaves: Sequence[Leaf], fields: Mapping[str, Any], rows: int, *, room
 
 
 def decode(leaves: Sequence[Leaf], messages: Messages, wanted: Iterable[str]) -> dict[str, Any]:
-    """Values of some leaves of messages.
+    """Values of the `wanted` leaves of messages, by name.
 
-    Args:
-        leaves: Leaves of the type.
-        messages: The messages.
-        wanted: Names of the leaves to read.
-
-    Returns:
-        Values by name: numbers of shape (M,), or (M, n) for n in a row; sequences padded with nan; stamps as
-        int64 [ns]; a list of M strings; a list of M tuples for sequences of strings.
-
-    Raises:
-        InputError: A message is too short for its type, or has another encoding.
+    Numbers have the shape (M,), or (M, n) for n in a row; sequences are padded with nan; stamps are int64
+    [ns]; strings a list of M, and sequences of strings of M tuples. A message that is too short for its type,
+    or has another encoding, is refused.
     """
     left, values_of = set(wanted), {}
     head = 0 if messages.packed else HEADER

@@ -19,12 +19,7 @@ STEP = 1 << 20
 
 
 class Room:
-    """What a compressed bag may still decompress to.
-
-    Args:
-        path: The bag.
-        files: Its files, whose sizes make its budget.
-    """
+    """What a compressed bag, of some files, may still decompress to."""
 
     def __init__(self, path: Path, files: list[Path]) -> None:
         self._path = path
@@ -32,11 +27,7 @@ class Room:
         self._spent = 0
 
     def file(self, source: Path, folder: Path) -> Path:
-        """Decompress a file into a folder; its name loses the suffix `.zstd`.
-
-        Raises:
-            InputError: The bag decompresses to more than the budget.
-        """
+        """Decompress a file into a folder, within the budget; its name loses the suffix `.zstd`."""
         place = folder / source.stem
         with pa.OSFile(os.fspath(source)) as packed, open(place, "xb") as file:
             for part in self._parts(packed):

@@ -30,13 +30,7 @@ MOST_QOS = 4_000
 
 
 class Db3Reader:
-    """A .db3 file: its topics, its metadata, and its messages on demand.
-
-    Attributes:
-        topics: Its topics.
-        notes: The custom data that a .db3 file holds.
-        definitions: Encoding and text of the definition of each message type, as far as it holds them.
-    """
+    """A .db3 file: its topics, and its messages on demand; attributes as those of `McapReader`."""
 
     whole, chunks = True, 0
     compression = frozenset[str]()
@@ -99,11 +93,7 @@ class Db3Reader:
 
 
 def _tables(database: sqlite3.Connection) -> set[str]:
-    """Names of its tables, in lower case, as sqlite ignores the case.
-
-    Raises:
-        InputError: A table is missing; or contents are computed, as a few bytes can make rows without end.
-    """
+    """Names of its tables, in lower case; computed ones are refused: they can have rows without end."""
     tables = set()
     for name, sql in database.execute("SELECT CAST(name AS BLOB), sql FROM sqlite_master"):
         name = (name or b"").decode(errors="replace").lower()

@@ -98,14 +98,7 @@ class Sender:
 
 
 def sender_of(robot: RobotSpec, *, unit: Unit = "T", rate_hz: float | None = None, **rest: Any) -> Sender:
-    """The sender of a robot's messages.
-
-    Args:
-        robot: Its sensors and drive.
-        unit: Unit of magnetic fields in messages.
-        rate_hz: Rate of the magnetometer [Hz]. Default: the robot's.
-        rest: `links`, `wheels`, `wheel_joints` and `description` of the sender.
-    """
+    """The sender of a robot's messages at a rate of the magnetometer [Hz]; `rest` are fields of `Sender`."""
     mounts = {"magnetometer": robot.magnetometer, "imu": robot.imu, "lidar": robot.lidar}
     frames, tilted = {}, []
     for name, mount in mounts.items():

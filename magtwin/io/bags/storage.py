@@ -92,10 +92,7 @@ def bag_metadata(
     span: tuple[int, int],
     custom: Any,
 ) -> dict[str, Any]:
-    """The content of metadata.yaml, below `rosbag2_bagfile_information`, of a bag of one MCAP file.
-
-    `counts` are messages by connection; `span` are the times of the first and the last message [ns].
-    """
+    """`rosbag2_bagfile_information` of metadata.yaml; `span` are the first and last time [ns]."""
     count = sum(counts.values())
     begin = {"nanoseconds_since_epoch": span[0] if count else 0}
     duration = {"nanoseconds": span[1] - span[0] if count else 0}

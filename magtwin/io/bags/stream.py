@@ -47,17 +47,10 @@ Sent = tuple[Topic, Index, dict[str, Any]]
 class Stream:
     """The messages of a run, rows after rows; remembers what was sent last.
 
-    Args:
-        run: Some rows, which define the columns.
-        sender: The robot.
-        lab: Fields of messages about the lab, by topic, which are sent once.
-        scans: The LiDAR's scans of the whole run; None sends no scans.
-        topics: Topics to send, as far as the run has their columns.
-        whole: Put every column into /magtwin/reading, not only those that no other topic carries, and the
-            run's metadata into /magtwin/columns: a recorder of live topics has no other source for them.
-
-    Raises:
-        InputError: A column cannot stand in a bag.
+    The rows of `run` define the columns. `lab` are fields of messages about the lab, which are sent once;
+    `scans` the LiDAR's of the whole run. A `whole` stream puts every column into /magtwin/reading, not only
+    those that no other topic carries, and the run's metadata into /magtwin/columns: a recorder of live topics
+    has no other source for them.
     """
 
     def __init__(
@@ -94,11 +87,7 @@ class Stream:
         """Topics that are sent."""
 
     def messages(self, run: Run) -> Iterator[Sent]:
-        """The messages of some rows.
-
-        Raises:
-            InputError: The columns differ from the first rows, or time does not ascend.
-        """
+        """The messages of some rows, which have the same columns as the first and later times."""
         if {name: (values.dtype, values.shape[1:]) for name, values in run.items()} != self._columns:
             raise InputError(f"rows of a bag must have the same columns, {', '.join(self._columns)}")
         t, stamps = self._checked(run)

@@ -42,12 +42,8 @@ def typestore() -> Any:
 def definition_of(kind: str, digest: str = "") -> tuple[str, str]:
     """The definition of a message type as text, and its REP 2011 hash.
 
-    Args:
-        kind: The type.
-        digest: Hash of the wanted definition, as distributions may differ. Default: that of `typestore`.
-
-    Raises:
-        InputError: The type is unknown, or no distribution defines it with that hash.
+    `digest` is the hash of the wanted definition, as distributions may differ; by default that of
+    `typestore`.
     """
     fields_of(kind)
     for store in (typestore(), *map(store_of, ("jazzy", "latest"))):
@@ -57,11 +53,7 @@ def definition_of(kind: str, digest: str = "") -> tuple[str, str]:
 
 
 def fields_of(kind: str) -> list[tuple[str, Any]]:
-    """Name and rosbags description of each field of a message type.
-
-    Raises:
-        InputError: The type is unknown.
-    """
+    """Name and rosbags description of each field of a message type."""
     known = typestore().fielddefs
     if kind not in known:
         raise InputError(f"unknown message type {kind!r}; {hint(kind, known)}")
@@ -103,19 +95,11 @@ class Types:
 
 
 def layout(kind: str, counts: Mapping[str, Any] | None = None) -> tuple[Leaf, ...]:
-    """The leaves of a message type, in the order of its bytes.
+    """The leaves of a message type, such as `sensor_msgs/msg/Imu`, in the order of its bytes.
 
     `geometry_msgs/msg/Point` and other structures of equal numbers are one leaf. A sequence of structures,
     such as `transforms` of a TFMessage, is a leaf with its length, and the leaves `transforms.0.header.stamp`
-    and so on of each element.
-
-    Args:
-        kind: The type, such as `sensor_msgs/msg/Imu`.
-        counts: Lengths of sequences of structures, by leaf name; other entries are ignored. A sequence
-            without a length must be empty.
-
-    Raises:
-        InputError: The type is unknown.
+    and so on of each element. `counts` are lengths of such sequences by leaf name; others must be empty.
     """
     plain = _layout(kind)
     return (

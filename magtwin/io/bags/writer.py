@@ -158,14 +158,7 @@ class RawBagWriter:
     """A bag that grows by messages in CDR, of any topics; a killed process leaves all that was flushed.
 
     Until it ends it has another name: `run.partial.mcap` for `run.mcap`, `bag.partial` for a folder `bag`.
-    `read_bag` reads it at any time.
-
-    Args:
-        path: The folder to make, or a single file that ends in .mcap.
-        force: Replace an existing bag, and the rest of an earlier recording.
-
-    Raises:
-        InputError: The path exists and `force` is not set, or cannot be written.
+    `read_bag` reads it at any time. `force` replaces a bag, and the rest of an earlier recording.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -186,17 +179,7 @@ class RawBagWriter:
         self._arrived = 0
 
     def add(self, topic: str, kind: str, qos: Qos, *, digest: str = "") -> None:
-        """Register a topic, before its first message.
-
-        Args:
-            topic: Its name.
-            kind: Its message type.
-            qos: Its quality of service.
-            digest: As for `magtwin.io.bags.types.definition_of`.
-
-        Raises:
-            InputError: Its message type is unknown.
-        """
+        """Register a topic, before its first message; `digest` as for `types.definition_of`."""
         if topic not in self._bag.connections:
             try:
                 with one_line(self.path):
@@ -247,11 +230,7 @@ class RawBagWriter:
 
 
 def check_suffix(path: Path) -> None:
-    """Refuse a path that is no bag's to be written.
-
-    Raises:
-        InputError: So it is.
-    """
+    """Refuse a path that is no bag's to be written."""
     if path.suffix.lower() not in ("", ".mcap", PARTIAL):
         raise InputError(
             f"{path}: a bag is a folder, without a suffix, or a file that ends in .mcap; ros2 bag convert "

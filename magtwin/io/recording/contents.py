@@ -48,12 +48,7 @@ NEXT = {
 def info_of_bag(path: Path, **reading: Any) -> Report:
     """A report on a bag: its span, storage, topics and roles; and on its field and what it is fit for.
 
-    Args:
-        path: The bag.
-        reading: `topics`, `unit` and `scale` of `magtwin.io.bags.read_bag`.
-
-    Raises:
-        InputError: There is no bag, nothing of it can be read, or an option is wrong.
+    `reading` are `topics`, `unit` and `scale` of `magtwin.io.bags.read_bag`.
     """
     with Bag(path) as bag, np.errstate(over="ignore", invalid="ignore"):
         size = sum(file.stat().st_size for file in bag.files)

@@ -159,16 +159,9 @@ def kind_of(frame: str) -> str:
 
 
 def mount_of(role: Role, frames: Frames, known: StaticFrames) -> tuple[Mount | None, str]:
-    """Where the frame of messages is on the robot, and what is wrong with it.
+    """Where the frame of messages is on the robot, and what is wrong with it; "" if nothing is.
 
-    Args:
-        role: The role of the messages.
-        frames: Their frames.
-        known: The transforms.
-
-    Returns:
-        The mount of a part of the robot, None for base_link and for a frame whose place is not known; and the
-        fault, "" if there is none.
+    No mount: it is base_link, or its place is not known by the transforms.
     """
     header, child = map(plain, frames)
     stands = kind_of(header) == "fixed"
@@ -190,7 +183,7 @@ def mount_of(role: Role, frames: Frames, known: StaticFrames) -> tuple[Mount | N
 
 
 def in_base(role: Role, columns: Columns, mount: Mount) -> dict[str, NDArray[Any]]:
-    """The columns of messages of a part of the robot as those of its base.
+    """The columns of messages of a part of the robot, by its mount, as those of the robot's base.
 
     With p_base_part and q_base_part of the mount, vectors are rotate(q_base_part, v_part), poses are
 
@@ -200,11 +193,6 @@ def in_base(role: Role, columns: Columns, mount: Mount) -> dict[str, NDArray[Any
     and the velocity of base is v_base = rotate(q_base_part, v_part) - w_base x p_base_part. An IMU's
     orientation is that of its own axes (REP 145), unless its accelerations contain gravity and show that the
     driver gives that of base.
-
-    Args:
-        role: The role of the columns.
-        columns: Columns of messages, one row each.
-        mount: Where the part is.
     """
     p, q = mount.p, mount.q_xyzw
     turned = 2 * np.linalg.norm(q[:3]) > TURNED_RAD
@@ -231,11 +219,7 @@ def _of_base(given: Array, turned: Array, a_base: Array) -> bool:
 
 
 def frames_of(leaves: Iterable[Leaf], messages: Messages) -> Frames:
-    """The frames of the messages of a topic, whose type has some leaves.
-
-    Raises:
-        InputError: They have several frames.
-    """
+    """The frames of the messages of a topic, whose type has some leaves; several are refused."""
     leaves = tuple(leaves)
     wanted = [leaf.name for leaf in leaves if leaf.name in LEAVES]
     names = decode(leaves, messages, wanted)

@@ -121,10 +121,7 @@ VITAL = (MAGNITUDE, POSE, ODOMETRY, VECTOR)
 
 
 def role_of(columns: Iterable[str]) -> Role | None:
-    """The role of messages of some columns; None if no column depends on a frame.
-
-    A magnitude and the times of scans, which is all that is read of them, have no axes.
-    """
+    """The role of messages of some columns; None if none has axes, as a magnitude or a scan's time."""
     moved = (role for role in ROLES.values() if role.position or role.vectors)
     return next((role for role in moved if {role.position or role.vectors[0]} & set(columns)), None)
 
@@ -208,21 +205,13 @@ def _best(leaves: list[str]) -> str | None:
 
 
 def check_roles(topics: Iterable[str]) -> None:
-    """Refuse topics that are not those of roles, by their names in `TOPICS`.
-
-    Raises:
-        InputError: So it is.
-    """
+    """Refuse topics that are not those of roles, by their names in `TOPICS`."""
     for name in topics:
         find("topic", name, {topic.name: topic for topic in ROLES})
 
 
 def check_kind(role: Topic, bag: "Bag", name: str) -> None:
-    """Refuse a topic that was chosen for a role and is missing or of another type.
-
-    Raises:
-        InputError: So it is.
-    """
+    """Refuse a topic that was chosen for a role and is missing or of another type."""
     if name not in bag.kinds:
         raise bag.missing(name)
     if not can_be(role, bag, name):

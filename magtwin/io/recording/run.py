@@ -398,10 +398,7 @@ class Recording:
         return signal, when
 
     def _in_base(self, signal: Signal, columns: Columns) -> Columns:
-        """Columns of a signal as those of base_link.
-
-        Warns if its frame cannot be that of such a signal.
-        """
+        """Columns of a signal as those of base_link. Warns if its frame cannot be that of such a signal."""
         role, frames = role_of(columns), self._frames(signal)
         if role is None:
             return columns

@@ -64,17 +64,7 @@ class Signal(NamedTuple):
 
 
 def read_signal(bag: Bag, name: str, topic: Topic, messages: Messages) -> Signal:
-    """The messages of a topic, decoded. A few that cannot be decoded are left out.
-
-    Args:
-        bag: The bag.
-        name: Name of the topic in the bag.
-        topic: Its role.
-        messages: Its messages.
-
-    Raises:
-        InputError: Its messages are not of its type.
-    """
+    """The messages of a topic of a bag, decoded for a role. A few that cannot be decoded are left out."""
     topic, leaves = reads_of(topic, bag, name), bag.layout(name)
     known = {leaf.name: leaf.kind for leaf in leaves}
     stamp = next((leaf for leaf in STAMPS if known.get(leaf) in ("time", "u8")), None)

@@ -52,19 +52,10 @@ class Order(NamedTuple):
 
 
 def in_order(ns: Index, received: Index, where: Path, topic: str) -> Order:
-    """Messages in the order of their times.
+    """Messages, given in the order of receipt, in the order of their times [ns], shape (M,).
 
     Messages that overtook each other are sorted. A few whose stamp is 0, or more than `JUMP_S` from those
-    around it, are left out.
-
-    Args:
-        ns: Times of the messages, in the order of receipt [ns], shape (M,).
-        received: Times of receipt [ns], shape (M,).
-        where: The bag, for refusals.
-        topic: The topic, for refusals.
-
-    Raises:
-        InputError: The clock of the stamps jumps for good, or too many stamps are wrong.
+    around it, are left out. Refused is a clock that jumps for good, or is wrong too often.
     """
     everyone = np.arange(len(ns))
     steps = np.diff(ns)

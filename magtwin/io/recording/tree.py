@@ -75,14 +75,10 @@ class Tree:
         return self.moving[frame][0] if frame in self.moving else self.static.parents.get(frame, ("",))[0]
 
     def at(self, frame: str, ns: Index) -> tuple[Array, Array]:
-        """Origin [m] and axes (xyzw) of a frame in the root of its tree, shape (M, 3) and (M, 4).
+        """Origin [m] and axes (xyzw) of a frame in the root of its tree at times [ns], shapes (M, 3), (M, 4).
 
         p_root = p + rotate(q, p_child) and q_root = q q_child for each edge upwards. Between transforms it is
         interpolated, and beyond them the nearest one counts.
-
-        Args:
-            frame: The frame.
-            ns: Times [ns], shape (M,).
         """
         p, q = np.zeros((len(ns), 3)), np.tile(IDENTITY_XYZW, (len(ns), 1)).astype(float)
         for name in self.up(frame)[:-1]:
@@ -100,11 +96,7 @@ class Tree:
     def base(self, near: str = "") -> str:
         """The robot's base, whose pose moves in a frame that stands still; "" if there is none.
 
-        Args:
-            near: A frame on the robot, which decides between several robots.
-
-        Raises:
-            InputError: There are several robots.
+        A frame `near` on the robot decides between several robots, which are refused else.
         """
         names = {*self.moving, *self.static.parents}
         found = [name for name in names if kind_of(name) == "base" and self._moves(name)]

@@ -59,15 +59,10 @@ def is_survey(path: Path) -> bool:
 
 
 def table_of_log(path: Path, waypoints: Path | None = None) -> Table:
-    """The readings of a log, with their places.
+    """The readings of a log, with their places, by a table of marks `waypoints` if the log has none.
 
-    Args:
-        path: A table; a folder or a zip of tables, as phyphox and Sensor Logger write them; a trace of an
-            Android phone; or a log of a vehicle: PX4 (.ulg), ArduPilot (.bin) or HDF5.
-        waypoints: A table of marks, if the log has none.
-
-    Raises:
-        InputError: There is no field in it, or a part is damaged.
+    A log is a table; a folder or a zip of tables, as phyphox and Sensor Logger write them; a trace of an
+    Android phone; or a log of a vehicle: PX4 (.ulg), ArduPilot (.bin) or HDF5.
     """
     if is_log(path):
         parts = _parts(path)

@@ -90,16 +90,9 @@ def read_readings(
 def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
     """The readings of a Run: its measured field at the true pose of base_link.
 
-    Rows whose field is nan (outside the map) are left out; rows with lost lock are not good. Of a robot's
-    recording, rows between whose poses there is a gap are left out too, and vectors are read.
-
-    Args:
-        run: A run with p_world_base, yaw and b_measured_nt, or b_total_nt.
-        name: Name of the readings.
-        source: Source of the run.
-
-    Raises:
-        InputError: A column is missing, or no row has a field.
+    The run has p_world_base, yaw and b_measured_nt, or b_total_nt. Rows whose field is nan (outside the map)
+    are left out; rows with lost lock are not good. Of a robot's recording, rows between whose poses there is
+    a gap are left out too, and vectors are read.
     """
     field = next((c for c in ("b_measured_nt", "b_total_nt") if c in run and np.isfinite(run[c]).any()), None)
     if field is None:
