@@ -90,8 +90,7 @@ USD = Format(
     takes=frozenset(("scene_file", "fps")),
 )
 
-BAGS = (".mcap", ".db3", ".bag")
-"""Suffixes of storage files of bags."""
+BAGS = (".mcap", ".db3", ".bag")  # Suffixes of storage files of bags
 
 _SUFFIXES = {".parquet": "PARQUET", ".csv": "CSV", ".npz": "NPZ", ".rrd": "RERUN", ".json": "RELEASE"}
 _SUFFIXES |= {".mcap": "BAG", ".db3": "DB3", ".bag": "ROS1", ".usd": "USD", ".usda": "USD", ".usdc": "USD"}

@@ -41,8 +41,7 @@ CAUSES: Mapping[str, str] = {
 """Metadata that determine a run's columns, and the cause if they differ, likeliest first."""
 
 
-_MORE = 10
-"""How many times its readings a run may have by its rate and its length."""
+_MORE = 10  # How many times its readings a run may have by its rate and its length
 
 
 @dataclass(frozen=True)

@@ -33,11 +33,8 @@ from magtwin.files.file import read_text, sha256
 from magtwin.frames import canonical, quat_from_yaw, wrap_angle
 from magtwin.run.run import COLUMNS, Run
 
-_BETWEEN = re.compile(r"[\s,]*")
-"""Characters between frames."""
-
-_STUMP = re.compile(r"[A-Za-z-]{0,9}\s*")
-"""An incomplete word or sign at the end of half a frame."""
+_BETWEEN = re.compile(r"[\s,]*")  # Characters between frames
+_STUMP = re.compile(r"[A-Za-z-]{0,9}\s*")  # An incomplete word or sign at the end of half a frame
 
 _SIZES = {
     "timestamp": 1,
@@ -51,8 +48,7 @@ _SIZES = {
 }
 """Numbers of each entry of a frame; they may be in several lists."""
 
-_WIDTH = sum(_SIZES.values())
-"""Numbers in a frame."""
+_WIDTH = sum(_SIZES.values())  # Numbers in a frame
 
 
 def read_release(path: str | os.PathLike[str]) -> Run:

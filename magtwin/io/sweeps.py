@@ -30,8 +30,7 @@ LISTING = "runs.csv"
 LISTED = ("path", "seed", "session", "speed_m_s")
 ABOUT = "sweep.json"
 
-BLOCKS, BLOCK = 32, 16
-"""Processes get blocks of runs: at least so many blocks, of at most so many runs."""
+BLOCKS, BLOCK = 32, 16  # Processes get blocks of runs: at least so many blocks, of at most so many runs
 
 Progress = Callable[[int, int], Any]
 

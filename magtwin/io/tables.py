@@ -44,20 +44,14 @@ from magtwin.tables.parquet import load_parquet
 from magtwin.tables.quantities import QUANTITIES
 from magtwin.tables.table import Column, Table
 
-_ABOUT = "magtwin"
-"""Name of the member of an npz with the metadata, and first word of a CSV."""
+_ABOUT = "magtwin"  # Name of the member of an npz with the metadata, and first word of a CSV
 
 _OWN = {("t",): ("t",), ("x", "y"): ("p_world_base_x", "p_world_base_y"), ("heading",): ("yaw",)}
 """Columns of a Run that are known by the quantity that a table of another program names."""
 
-NUMBER = 8
-"""Bytes of a number in memory."""
-
-_CSV_ABOUT = 100_000
-"""Most lines of a CSV that begin with #; a run has one for each column, and three others."""
-
-_CSV_LINE = 1 << 20
-"""Longest line of a CSV [bytes]; a header of ten thousand columns is shorter."""
+NUMBER = 8  # Bytes of a number in memory
+_CSV_ABOUT = 100_000  # Most lines of a CSV that begin with #; a run has one for each column, and three others
+_CSV_LINE = 1 << 20  # Longest line of a CSV [bytes]; a header of ten thousand columns is shorter
 
 
 def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool = False) -> None:

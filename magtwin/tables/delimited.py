@@ -21,26 +21,13 @@ from magtwin.files.file import existing
 from magtwin.tables.labels import meaning_of, split_label
 from magtwin.tables.quantities import UNITS
 
-LONGEST_LINE = 65_536
-"""Longest line [characters]."""
-
-QUOTED = 60
-"""Most characters of a file that an error message quotes."""
-
-HEAD = 4096
-"""Bytes from which the encoding is found."""
-
-LOOKED = 50
-"""Lines from which the separator is found."""
-
-MOST_ABOVE = 20
-"""Most lines above the header, such as the name and the date of a recording."""
-
-LEAST_ROWS = 8
-"""Rows from which a last number can be told to be cut short."""
-
-LOST = 5.0
-"""Factor below all others from which a number is cut short; a lost digit makes it a tenth."""
+LONGEST_LINE = 65_536  # Longest line [characters]
+QUOTED = 60  # Most characters of a file that an error message quotes
+HEAD = 4096  # Bytes from which the encoding is found
+LOOKED = 50  # Lines from which the separator is found
+MOST_ABOVE = 20  # Most lines above the header, such as the name and the date of a recording
+LEAST_ROWS = 8  # Rows from which a last number can be told to be cut short
+LOST = 5.0  # Factor below all others from which a number is cut short; a lost digit makes it a tenth
 
 MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "*", "#na", "#nv", "#n/a"}
 """Words for a missing value, in lower case; `*` is that of Geosoft. Spreadsheets also write errors for them,
@@ -58,8 +45,7 @@ _THOUSANDS = re.compile(
 
 _BELOW_1000 = re.compile(r"\s*[+-]?\d{1,3}([.,]\d*)?\s*", re.ASCII)
 
-_BEGUN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d*)?([eE][+-]?)?", re.ASCII)
-"""The begin of a number."""
+_BEGUN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d*)?([eE][+-]?)?", re.ASCII)  # The begin of a number
 
 _SLASH = re.compile(r"\s*/([^\w,;]|\w+\s|$)")
 """A comment line of Geosoft's XYZ, and no word that begins with a slash, such as a topic of ROS."""
@@ -67,18 +53,12 @@ _SLASH = re.compile(r"\s*/([^\w,;]|\w+\s|$)")
 _TRACK = re.compile(r"\s*(line|tie)\s+(?=\S*\d)\S+\s*", re.IGNORECASE)
 """A line of Geosoft's XYZ that begins a survey line."""
 
-_REMARK = re.compile(r"\s*#\s*\w+:\s")
-"""A comment line `# KEY: VALUE`, as in maps written as CSV."""
+_REMARK = re.compile(r"\s*#\s*\w+:\s")  # A comment line `# KEY: VALUE`, as in maps written as CSV
 
 _ERROR = re.compile(r"\s*#(n/?a|nv|value!|div/0!|ref!|num!|name\?|null!)\s*", re.IGNORECASE)
-_CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f]")
-"""Characters that no text has."""
-
-_Lines = list[tuple[int, str]]
-"""Number and text of lines."""
-
-_Rows = list[tuple[int, list[str]]]
-"""Line and words of rows."""
+_CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f]")  # Characters that no text has
+_Lines = list[tuple[int, str]]  # Number and text of lines
+_Rows = list[tuple[int, list[str]]]  # Line and words of rows
 
 
 _PLACED = ("x", "y", "heading")

@@ -15,14 +15,9 @@ _SIGNS = str.maketrans(
     }
 )
 _BRACKETS = re.compile(r"[\[\]()]")
-_LEFT_OUT = ("in", "per")
-"""Words between a name and its unit, and in a unit."""
-
-MOST_WORDS = 12
-"""Labels of more words name nothing."""
-
-LONGEST = 500
-"""Characters of a label that are read."""
+_LEFT_OUT = ("in", "per")  # Words between a name and its unit, and in a unit
+MOST_WORDS = 12  # Labels of more words name nothing
+LONGEST = 500  # Characters of a label that are read
 
 
 class Label(NamedTuple):

@@ -17,14 +17,9 @@ from magtwin.files.protobuf import varint
 
 _MAGIC = b"PAR1"
 
-_BATCH = 1 << 20
-"""Most rows of texts that are measured at once."""
-
-_TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
-"""Ticks per second of a timestamp of Arrow, by its unit."""
-
-_FIXED = "FIXED_LEN_BYTE_ARRAY"
-"""Texts of equal length, whose length is in the metadata."""
+_BATCH = 1 << 20  # Most rows of texts that are measured at once
+_TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}  # Ticks per second of a timestamp of Arrow, by its unit
+_FIXED = "FIXED_LEN_BYTE_ARRAY"  # Texts of equal length, whose length is in the metadata
 
 _ROW_GROUPS, _COLUMNS, _ABOUT = 4, 1, 3
 _COUNT, _PACKED, _DATA, _DICTIONARY = 5, 7, 9, 11

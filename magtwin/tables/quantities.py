@@ -46,8 +46,7 @@ FIELDS = {
 }
 """nT per unit of the magnetic field."""
 
-CLOCKWISE = (3,)
-"""Places among the names of a heading of those that count clockwise from north."""
+CLOCKWISE = (3,)  # Places among the names of a heading of those that count clockwise from north
 
 SPEEDS = {
     **dict.fromkeys(("m_s", "mps", "m_s_1"), 1.0),
@@ -200,5 +199,4 @@ QUANTITIES: dict[str, Quantity] = {
 }
 """Quantities by the symbol that programs use."""
 
-UNITS = frozenset(unit for quantity in QUANTITIES.values() for unit in quantity.units)
-"""All units."""
+UNITS = frozenset(unit for quantity in QUANTITIES.values() for unit in quantity.units)  # All units

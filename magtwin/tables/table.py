@@ -25,22 +25,16 @@ from magtwin.tables.quantities import QUANTITIES
 Array = NDArray[np.float64]
 
 PARQUET = (".parquet", ".pq")
-SPREADSHEETS = (".xlsx", ".xls", ".ods")
-"""Suffixes of Parquet and of spreadsheets; other tables are text."""
+SPREADSHEETS = (".xlsx", ".xls", ".ods")  # Suffixes of Parquet and of spreadsheets; other tables are text
 
 _EPOCHS = ((1e17, 1e9, "ns"), (1e14, 1e6, "us"), (1e11, 1e3, "ms"))
 """Least median of times since 1970, ticks per second and unit; below them are seconds."""
 
 _DATE = re.compile(r"\d{1,4}[-/.](\d{1,2}|[A-Za-z]{3})[-/.]\d{1,4}", re.ASCII)
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:\.\d*)?))?", re.ASCII)
-_DAYS = ("%Y-%m-%d", "%d-%m-%Y", "%m-%d-%Y", "%d-%b-%Y")
-"""Orders of a date, with a hyphen for any mark."""
-
-_CLOCKS = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")
-"""Times behind a date."""
-
-_READ = "2025-11-22T08:26:40"
-"""A date as an error message shows it."""
+_DAYS = ("%Y-%m-%d", "%d-%m-%Y", "%m-%d-%Y", "%d-%b-%Y")  # Orders of a date, with a hyphen for any mark
+_CLOCKS = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")  # Times behind a date
+_READ = "2025-11-22T08:26:40"  # A date as an error message shows it
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,8 +30,7 @@ from magtwin.run.run import Metadata
 SUFFIXES: dict[str, Any] = {".mcap": McapReader, ".db3": Db3Reader, ".bag": Ros1Reader}
 """Readers of storage files, by suffix."""
 
-LONGEST_LINE = 2000
-"""Most characters of an error message."""
+LONGEST_LINE = 2000  # Most characters of an error message
 
 
 class Bag:

@@ -21,17 +21,10 @@ from magtwin.errors import InputError
 Bytes = NDArray[np.uint8]
 Index = NDArray[np.int64]
 
-HEADER = 4
-"""Bytes of the encapsulation header before the first leaf."""
-
-MOST_TEXTS = 4096
-"""Largest number of strings in a sequence."""
-
-MOST_PADDING = 64
-"""Largest array for sequences of unequal length, in bytes for each byte of the messages."""
-
-NS = 10**9
-"""Nanoseconds in a second."""
+HEADER = 4  # Bytes of the encapsulation header before the first leaf
+MOST_TEXTS = 4096  # Largest number of strings in a sequence
+MOST_PADDING = 64  # Largest array for sequences of unequal length, in bytes for each byte of the messages
+NS = 10**9  # Nanoseconds in a second
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ import pyarrow as pa
 from magtwin.files.budget import check_decoded
 from magtwin.io.bags.cdr import Messages
 
-STEP = 1 << 20
-"""Bytes that are decompressed at once."""
+STEP = 1 << 20  # Bytes that are decompressed at once
 
 
 class Room:

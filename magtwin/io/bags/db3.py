@@ -22,11 +22,8 @@ _STEPS_PER_BYTE = 5
 """Further steps for each byte of a file. A message takes about 20 and has 20 bytes or more, but pages of a
 damaged file can lead to each other again and again."""
 
-_ROWS = 10_000
-"""Most topics of a bag."""
-
-MOST_QOS = 4_000
-"""Characters of the quality of service of a topic that are read."""
+_ROWS = 10_000  # Most topics of a bag
+MOST_QOS = 4_000  # Characters of the quality of service of a topic that are read
 
 
 class Db3Reader:

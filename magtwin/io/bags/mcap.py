@@ -30,33 +30,22 @@ from magtwin.io.bags.storage import ROOM, Batch, Connection, StoredTopic, in_tim
 
 MAGIC = b"\x89MCAP0\r\n"
 
-CHUNK = 1 << 20
-"""Approximate bytes of a chunk before compression."""
-
-LARGEST_CHUNK = BUDGETS["bag"].count
-"""Largest chunk that is read [bytes]."""
-
-MOST_RATIO = 1000
-"""Largest compression ratio that is accepted, beyond `SPARE`."""
+CHUNK = 1 << 20  # Approximate bytes of a chunk before compression
+LARGEST_CHUNK = BUDGETS["bag"].count  # Largest chunk that is read [bytes]
+MOST_RATIO = 1000  # Largest compression ratio that is accepted, beyond `SPARE`
 
 SPARE = 1 << 26
 """Bytes that the chunks of a file may hold beyond `MOST_RATIO`: blank images compress to almost nothing."""
 
-LEVEL = 1
-"""Compression level of zstd."""
-
-FOOTER = 29
-"""Bytes of the record that ends a file."""
-
-PRIVATE = 0x80
-"""Opcodes from which a record is of no concern."""
+LEVEL = 1  # Compression level of zstd
+FOOTER = 29  # Bytes of the record that ends a file
+PRIVATE = 0x80  # Opcodes from which a record is of no concern
 
 _DAMAGED = (ValueError, struct.error, McapError, IndexError, OverflowError)
 """What the library raises for a damaged record."""
 
 _HEAD = struct.Struct("<BQ")
-_RECORD = struct.Struct("<BQH")
-"""Opcode and length of a record, and the channel of a message."""
+_RECORD = struct.Struct("<BQH")  # Opcode and length of a record, and the channel of a message
 
 
 def _bytes(record: records.McapRecord) -> bytes:

@@ -10,8 +10,7 @@ from magtwin.files.budget import check_decoded
 from magtwin.io.bags.cdr import Index, Messages
 from magtwin.io.bags.storage import StoredTopic
 
-_NOW = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
-"""Types that have another name today."""
+_NOW = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}  # Types that have another name today
 
 
 class Ros1Reader:

@@ -13,14 +13,9 @@ from numpy.typing import NDArray
 from magtwin.io.bags.cdr import Bytes, Index
 from magtwin.io.bags.topics import Qos
 
-VERSION = 8
-"""Version of metadata.yaml: the newest one that ROS 2 Humble reads."""
-
-ROOM = 31
-"""Bytes left free before each message of a batch, for the head of an MCAP message record."""
-
-PARTIAL = ".partial"
-"""Inserted before the suffix of a bag until it ends."""
+VERSION = 8  # Version of metadata.yaml: the newest one that ROS 2 Humble reads
+ROOM = 31  # Bytes left free before each message of a batch, for the head of an MCAP message record
+PARTIAL = ".partial"  # Inserted before the suffix of a bag until it ends
 
 
 def partial_of(path: Path) -> Path:

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-LATEST_S = 2.0**31
-"""First time that ROS stamps cannot hold [s]."""
+LATEST_S = 2.0**31  # First time that ROS stamps cannot hold [s]
 
 
 @dataclass

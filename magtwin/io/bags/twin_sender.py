@@ -11,8 +11,7 @@ from magtwin.io.bags.sender import FixedFrame, Sender, Unit, WheelJoint, sender_
 if TYPE_CHECKING:
     from magtwin.twin import Twin
 
-FOOTPRINT = "base_footprint"
-"""Name of the frame below base_link on the floor, as in REP 120."""
+FOOTPRINT = "base_footprint"  # Name of the frame below base_link on the floor, as in REP 120
 
 
 def sender_for(twin: "Twin | None", unit: Unit, rate_hz: Any = None) -> Sender:

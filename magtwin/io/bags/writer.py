@@ -30,14 +30,9 @@ if TYPE_CHECKING:
     from magtwin.sim.sensors.lidar import Scans
     from magtwin.twin import Twin
 
-CUSTOM = "magtwin."
-"""Prefix of a run's metadata in a bag's custom data; the values are JSON."""
-
-NOTE = "magtwin"
-"""Metadata record of an MCAP file that holds a run's metadata."""
-
-BLOCK = 16_384
-"""Rows written at a time."""
+CUSTOM = "magtwin."  # Prefix of a run's metadata in a bag's custom data; the values are JSON
+NOTE = "magtwin"  # Metadata record of an MCAP file that holds a run's metadata
+BLOCK = 16_384  # Rows written at a time
 
 INSIDE = "run.mcap"
 """Name that a single storage file gives itself, so that its bytes do not depend on the one that it has."""

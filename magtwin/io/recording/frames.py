@@ -29,8 +29,7 @@ from magtwin.io.recording.roles import Role
 
 Array = NDArray[np.float64]
 Columns = Mapping[str, NDArray[Any]]
-Frames = tuple[str, str]
-"""Frame of the header and child frame of a message; "" if it has none."""
+Frames = tuple[str, str]  # Frame of the header and child frame of a message; "" if it has none
 
 LEAVES = ("header.frame_id", "child_frame_id")
 
@@ -42,14 +41,12 @@ WORDS: Mapping[str, str] = {
 }
 """Words in names of frames that stand still, of parts of a robot, and of its base; the first match counts."""
 
-TURNED_RAD, MOVED_M = 1e-6, 1e-6
-"""Turns [rad] and distances [m] below which a transform is none."""
+TURNED_RAD, MOVED_M = 1e-6, 1e-6  # Turns [rad] and distances [m] below which a transform is none
 
 TILTED_M_S2 = 0.5
 """Difference of the mean upward accelerations from which gravity decides what an orientation is of [m/s2]."""
 
-MOST_TRANSFORMS = 256
-"""Messages of more transforms are not read."""
+MOST_TRANSFORMS = 256  # Messages of more transforms are not read
 
 _TRANSFORM = (
     "header.stamp",

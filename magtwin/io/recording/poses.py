@@ -8,14 +8,9 @@ from magtwin.run.resample import linear, quaternion
 
 Array = NDArray[np.float64]
 
-GAP = 5.0
-"""Poses further apart than this multiple of their median interval are not interpolated between."""
-
-LEAST_GAP_S = 0.1
-"""Poses closer than this are always interpolated between [s]."""
-
-UNIT_WITHIN = 0.01
-"""Largest error of the length of a quaternion."""
+GAP = 5.0  # Poses further apart than this multiple of their median interval are not interpolated between
+LEAST_GAP_S = 0.1  # Poses closer than this are always interpolated between [s]
+UNIT_WITHIN = 0.01  # Largest error of the length of a quaternion
 
 
 def poses_at(t: Array, pose_t: Array, pose: Array) -> tuple[Array, Array, NDArray[np.bool_]]:

@@ -14,11 +14,8 @@ from magtwin.io.bags.topics import BATTERY, COMMAND, IMU, MAGNITUDE, ODOMETRY, P
 if TYPE_CHECKING:
     from magtwin.io.bags.bag import Bag
 
-LEAST = 2
-"""Messages from which a topic is a stream. One with fewer has a role only if there is no stream."""
-
-NUMBERS = ("f4", "f8")
-"""Kinds of leaves that can be a field."""
+LEAST = 2  # Messages from which a topic is a stream. One with fewer has a role only if there is no stream.
+NUMBERS = ("f4", "f8")  # Kinds of leaves that can be a field
 
 
 @dataclass(frozen=True, kw_only=True)

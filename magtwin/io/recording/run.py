@@ -42,17 +42,10 @@ from magtwin.run.run import COLUMNS, Run
 Array = NDArray[np.float64]
 Columns = dict[str, NDArray[Any]]
 
-SCAN_S = 0.5
-"""Time after a scan during which a LiDAR counts as on [s]."""
-
-GRAVITY = 9.80665
-"""Standard gravity [m/s2]."""
-
-MOVED_M, MOVED_RAD = 0.001, 0.002
-"""Correction of odometry by transforms below which there is none [m], [rad]."""
-
-TRANSFORMS = "tf"
-"""Given in place of a topic of poses: the pose of the robot's base by /tf."""
+SCAN_S = 0.5  # Time after a scan during which a LiDAR counts as on [s]
+GRAVITY = 9.80665  # Standard gravity [m/s2]
+MOVED_M, MOVED_RAD = 0.001, 0.002  # Correction of odometry by transforms below which there is none [m], [rad]
+TRANSFORMS = "tf"  # Given in place of a topic of poses: the pose of the robot's base by /tf
 
 
 def read_recording(

@@ -16,11 +16,8 @@ from magtwin.io.recording.poses import poses_at
 
 Array = NDArray[np.float64]
 
-STILL = 1e-9
-"""Largest change of a transform on /tf that does not move [m] and parts of a quaternion."""
-
-MOST_DESCRIPTION = 4_000_000
-"""Longest description that is read [characters]."""
+STILL = 1e-9  # Largest change of a transform on /tf that does not move [m] and parts of a quaternion
+MOST_DESCRIPTION = 4_000_000  # Longest description that is read [characters]
 
 
 class Tree:

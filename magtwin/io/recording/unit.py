@@ -11,8 +11,7 @@ from magtwin.field.units import INDOORS_NT, LEAST_USUAL_NT, MOST_USUAL_NT, NT_PE
 
 Array = NDArray[np.float64]
 
-IRON = 2.0
-"""Factor by which iron near the sensor may change the median of the field."""
+IRON = 2.0  # Factor by which iron near the sensor may change the median of the field
 
 
 class Field(NamedTuple):

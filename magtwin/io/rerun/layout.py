@@ -27,8 +27,7 @@ from magtwin.spec.lab import LabSpec
 
 Array = NDArray[np.float64]
 
-_ROOM = 0.08
-"""Room beyond the values and the ticks of an axis, as a share of the range of the values."""
+_ROOM = 0.08  # Room beyond the values and the ticks of an axis, as a share of the range of the values
 
 Colour = tuple[int, int, int]
 
@@ -58,8 +57,7 @@ _DIM = (118, 106, 150)
 _NAMES = {_BLUE: "blue", _ORANGE: "orange", _GREEN: "green", _GREY: "grey", _DIM: "violet"}
 """Names of colours, which the title of a plot gives with its lines, in place of a legend over them."""
 
-_SPIKES = 0.005
-"""Share of the largest and of the smallest values of an error that its axis may leave out."""
+_SPIKES = 0.005  # Share of the largest and of the smallest values of an error that its axis may leave out
 
 PLOTS: Mapping[str, Mapping[str, tuple[Series, ...]]] = {
     "": {

@@ -22,11 +22,8 @@ from magtwin.run.run import Run
 
 FLOOR, PATHS = "floor", "floor/paths"
 
-MOST_PARTICLES = 300
-"""Particles drawn at a time, each of the same weight."""
-
-ARROW_M = 0.25
-"""Length of the arrows that show the headings [m]."""
+MOST_PARTICLES = 300  # Particles drawn at a time, each of the same weight
+ARROW_M = 0.25  # Length of the arrows that show the headings [m]
 
 TRUTH, ESTIMATE, DEAD, BOUND, BAND = (
     *((235, 235, 235), (255, 130, 50), (86, 156, 255), (92, 200, 120)),

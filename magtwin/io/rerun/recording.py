@@ -37,23 +37,12 @@ from magtwin.twin import Twin
 
 APPLICATION = "magtwin"
 
-PATIENCE_S = 60.0
-"""Time that Rerun may take to write its data [s]."""
-
-NEVER = timedelta(days=1)
-"""Time after which Rerun writes what it has, however little."""
-
-END = b"RRF2FOOT"
-"""Bytes at the end of a complete file."""
-
-ROOM = 1 << 20
-"""Upper bound of the bytes of a layout, the metadata and the column names."""
-
-_stuck = threading.Event()
-"""Set once Rerun waits for ever, for a thread that a full disk has ended."""
-
-POSED = frozenset(("p_world_base", "q_world_base_xyzw"))
-"""Columns that place a robot."""
+PATIENCE_S = 60.0  # Time that Rerun may take to write its data [s]
+NEVER = timedelta(days=1)  # Time after which Rerun writes what it has, however little
+END = b"RRF2FOOT"  # Bytes at the end of a complete file
+ROOM = 1 << 20  # Upper bound of the bytes of a layout, the metadata and the column names
+_stuck = threading.Event()  # Set once Rerun waits for ever, for a thread that a full disk has ended
+POSED = frozenset(("p_world_base", "q_world_base_xyzw"))  # Columns that place a robot
 
 
 def check_room(file: FilePath, size: int, final: FilePath | None = None) -> None:

@@ -25,8 +25,7 @@ from magtwin.run.run import COLUMNS, Run, check_numbers
 
 Array = NDArray[np.float64]
 
-TIMELINE = "sim_time"
-"""Name of the timeline of a recording."""
+TIMELINE = "sim_time"  # Name of the timeline of a recording
 
 BLOCK = 4096
 """Rows per chunk: few enough for the viewer to skip what it does not show, and for LZ4, with its window of
@@ -39,8 +38,7 @@ FACTS, NAMES, NAME, ROWS = "magtwin_facts", "magtwin_columns", "magtwin_name", "
 """Components without time: metadata and columns as JSON, the name of the run among several, and the number of
 rows of a complete run."""
 
-GAP_S = 0.5
-"""Time that a flag must be down for its event to be over [s]."""
+GAP_S = 0.5  # Time that a flag must be down for its event to be over [s]
 
 
 @dataclass(frozen=True)
@@ -87,8 +85,7 @@ DERIVED = (
 )
 """Lines of the plots that are not columns: see `derived`."""
 
-ERRORS = ("error_nt", *DERIVED[-4:])
-"""Lines whose axis leaves out rare spikes."""
+ERRORS = ("error_nt", *DERIVED[-4:])  # Lines whose axis leaves out rare spikes
 
 
 def derived(run: Run) -> dict[str, Array]:

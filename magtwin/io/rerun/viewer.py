@@ -31,8 +31,7 @@ from magtwin.parallel.machine import end_group, ends_with_parent
 
 LOCALHOST = "127.0.0.1"
 
-MAGIC = b"RRF"
-"""First bytes of a recording, before its format number."""
+MAGIC = b"RRF"  # First bytes of a recording, before its format number
 
 HEADER, ARROW = 12, 2
 """Bytes of a recording before its first message, and the kind of messages that hold chunks."""
@@ -55,8 +54,7 @@ CANNOT_DRAW = re.compile(r"render context|adapter|graphics|wgpu|surface", re.IGN
 VULKAN = "without a graphics card it needs Vulkan in software: apt install mesa-vulkan-drivers libvulkan1"
 """What to do then."""
 
-TITLE_BAR = 36
-"""Height of the viewer's empty title bar [pixels]."""
+TITLE_BAR = 36  # Height of the viewer's empty title bar [pixels]
 
 TOASTS_S, NOTHING_S = 6.0, 10.0
 """Time until the viewer's own notices have disappeared, and until a loaded file shows something [s]."""

@@ -25,26 +25,13 @@ from magtwin.usd.maps.heat_map import HEAT_MAP, HEAT_MAP_HEIGHT_M
 
 Array = NDArray[np.float64]
 
-SCAN = "world/scan"
-"""Entity of the LiDAR scans."""
-
-SCANS = 64
-"""Scans per chunk."""
-
-POSE_HZ = 50.0
-"""Greatest rate of poses. No eye sees a difference above it."""
-
-DOT_HZ = 10.0
-"""Greatest rate of readings drawn along the path."""
-
-SCALE_HEIGHT_M = 1.0
-"""Height of the colour bar [m]: above desks and chairs, which would hide it on the floor."""
-
-ARROW_M_PER_NT = 1.4e-5
-"""Length of the field arrow: 70 cm for 50 uT."""
-
-DRIVEN: Colour = (230, 60, 60)
-"""Colour of a driven path."""
+SCAN = "world/scan"  # Entity of the LiDAR scans
+SCANS = 64  # Scans per chunk
+POSE_HZ = 50.0  # Greatest rate of poses. No eye sees a difference above it.
+DOT_HZ = 10.0  # Greatest rate of readings drawn along the path
+SCALE_HEIGHT_M = 1.0  # Height of the colour bar [m]: above desks and chairs, which would hide it on the floor
+ARROW_M_PER_NT = 1.4e-5  # Length of the field arrow: 70 cm for 50 uT
+DRIVEN: Colour = (230, 60, 60)  # Colour of a driven path
 
 
 @dataclass(frozen=True)

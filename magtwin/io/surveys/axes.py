@@ -8,17 +8,13 @@ from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
 
 Array = NDArray[np.float64]
 
-TURNED = 0.7
-"""Length of the mean unit vector of the headings above which a survey hardly turned."""
-
-ALIGNED = 0.8
-"""Ratio of the mean level field to its size above which it keeps one direction."""
+TURNED = 0.7  # Length of the mean unit vector of the headings above which a survey hardly turned
+ALIGNED = 0.8  # Ratio of the mean level field to its size above which it keeps one direction
 
 CLEARLY = 0.3
 """Difference of these ratios from which headings or vectors are mirrored. Hard iron does not look so."""
 
-LEAST_READINGS = 8
-"""Fewest readings from which headings are judged."""
+LEAST_READINGS = 8  # Fewest readings from which headings are judged
 
 
 def levelled(vector_nt: Array, turn: Array, axes: str) -> Array:

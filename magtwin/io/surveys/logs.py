@@ -22,8 +22,7 @@ from magtwin.tables.table import PARQUET, SPREADSHEETS, Column, Table, read_tabl
 Array = NDArray[np.float64]
 Parts = Mapping[str, Table]
 
-VEHICLES = (".ulg", ".bin", ".h5", ".hdf5")
-"""Suffixes of the logs that `magtwin.io.surveys.vehicles` reads."""
+VEHICLES = (".ulg", ".bin", ".h5", ".hdf5")  # Suffixes of the logs that `magtwin.io.surveys.vehicles` reads
 
 TABLES = (".csv", ".txt", *SPREADSHEETS)
 FIELD = ("magnetometer", "magnetic", "mag", "magneticfield", "raw")
@@ -31,14 +30,12 @@ MARKS = ("annotation", "annotations", "waypoint", "waypoints", "mark", "marks", 
 ACCELERATION = ("accelerometer", "acceleration", "acc", "accel", "linear")
 """Words in the names of the tables of a log."""
 
-MOST_PARTS = 200
-"""Most tables of a log."""
+MOST_PARTS = 200  # Most tables of a log
 
 _TRACE = re.compile(rb"^\d+\tTYPE_[A-Z_]+\t", re.M)
 """A line of a trace of an Android phone: time [ms], sensor, values."""
 
-BETWEEN = 0.2
-"""Share of the rows below which rows with places are marks, and others lie between them."""
+BETWEEN = 0.2  # Share of the rows below which rows with places are marks, and others lie between them
 
 
 def is_log(path: Path) -> bool:

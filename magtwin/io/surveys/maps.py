@@ -29,14 +29,9 @@ Split = Literal["checkerboard", "heading", "run", "block"]
 Progress = Callable[..., None]
 Vector = tuple[float, float, float]
 
-LEAST_READINGS = 8
-"""Smallest number of good readings that a map can be fitted to."""
-
-USUAL_READINGS = 100
-"""Number of good readings below which the report doubts the map."""
-
-MOST_MASKED = 0.9
-"""Share of masked nodes above which the report doubts the map."""
+LEAST_READINGS = 8  # Smallest number of good readings that a map can be fitted to
+USUAL_READINGS = 100  # Number of good readings below which the report doubts the map
+MOST_MASKED = 0.9  # Share of masked nodes above which the report doubts the map
 
 
 def import_survey(

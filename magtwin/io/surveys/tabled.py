@@ -23,14 +23,9 @@ from magtwin.tables.table import Table, since_1970
 
 Array = NDArray[np.float64]
 
-LEAST_SPAN_M = 0.01
-"""Extent below which the report asks whether positions are in degrees [m]."""
-
-APART = 2.0
-"""Largest median ratio between vectors and magnitudes of the same table."""
-
-SAME_LENGTH = 0.01
-"""Largest median difference of x, y, z from the magnitude by which they are its components."""
+LEAST_SPAN_M = 0.01  # Extent below which the report asks whether positions are in degrees [m]
+APART = 2.0  # Largest median ratio between vectors and magnitudes of the same table
+SAME_LENGTH = 0.01  # Largest median difference of x, y, z from the magnitude by which they are its components
 
 
 def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Readings:

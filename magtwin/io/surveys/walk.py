@@ -18,14 +18,9 @@ NOTES = ("text", "note", "notes", "annotation", "comment", "label", "remark", "e
 _PLACE = re.compile(r"\D*?([+-]?\d+(?:\.\d+)?)\s*[,;/ ]\s*(?:y\s*=?\s*)?([+-]?\d+(?:\.\d+)?)\s*\D*", re.ASCII)
 """A place in a note: `1.5,2`, `(1.5; 2)` or `x=1.5 y=2`."""
 
-LEAST_COVERED = 0.1
-"""Share of the log's time below which marks must be in another unit."""
-
-STILL_M_S2 = 0.4
-"""Standard deviation of the acceleration within a second below which nobody walks [m/s^2]."""
-
-LEAST_PAUSE_S = 1.5
-"""Shortest pause that counts [s]."""
+LEAST_COVERED = 0.1  # Share of the log's time below which marks must be in another unit
+STILL_M_S2 = 0.4  # Standard deviation of the acceleration within a second below which nobody walks [m/s^2]
+LEAST_PAUSE_S = 1.5  # Shortest pause that counts [s]
 
 QUIET, LIVELY = 4.0, 20.0
 """Changes of the field within a second, in standard deviations of its means over a second: below the first
