@@ -142,15 +142,11 @@ class Outputs:
 
     folder: Path | None
     files: tuple[Path, ...] = ()
-    scans: tuple[Path, ...] = ()
-    """Tables of the LiDAR's scans, beside Parquet files."""
+    scans: tuple[Path, ...] = ()  # Tables of the LiDAR's scans, beside Parquet files
     force: bool = False
-    out_unit: Literal["T", "nT"] | None = None
-    """Unit of the field in bags. None: T."""
-    usd_fps: float | None = None
-    """Frames per second in USD, 0 for one per reading. None: 30."""
-    robot: str = ""
-    """Robot whose name becomes part of the file names, in a scene of several."""
+    out_unit: Literal["T", "nT"] | None = None  # Unit of the field in bags. None: T.
+    usd_fps: float | None = None  # Frames per second in USD, 0 for one per reading. None: 30.
+    robot: str = ""  # Robot whose name becomes part of the file names, in a scene of several
     picture: Callable[[Driven, Path, bool], None] | None = None
     """Draws run.png in the folder: called with the run, the file and `force`."""
 

@@ -49,10 +49,8 @@ class Difference:
     """Difference of a column between a run and its reproduction."""
 
     column: str
-    rows: int
-    """Number of rows that differ."""
-    first: int
-    """The first of them."""
+    rows: int  # Number of rows that differ
+    first: int  # The first of them
     greatest: float
     """Largest absolute difference in the column's unit; nan if only one of the values is known."""
 
@@ -63,10 +61,8 @@ class Repeat:
 
     original: Run
     again: Run
-    causes: tuple[str, ...]
-    """Differing metadata that determine the columns, with old and new value."""
-    differences: tuple[Difference, ...]
-    """Columns that are not bit-identical."""
+    causes: tuple[str, ...]  # Differing metadata that determine the columns, with old and new value
+    differences: tuple[Difference, ...]  # Columns that are not bit-identical
 
     @property
     def equal(self) -> bool:

@@ -39,12 +39,10 @@ Progress = Callable[[int, int], Any]
 class Listed:
     """What is said of some runs."""
 
-    rows: list[list[Any]] = field(default_factory=list)
-    """Rows of runs.csv."""
+    rows: list[list[Any]] = field(default_factory=list)  # Rows of runs.csv
 
     paths: dict[str, None] = field(default_factory=dict)
-    sessions: dict[str, str] = field(default_factory=dict)
-    """Session by session and its seed."""
+    sessions: dict[str, str] = field(default_factory=dict)  # Session by session and its seed
 
     driven_s: float = 0.0
     tally: Tally = field(default_factory=Tally)

@@ -156,8 +156,7 @@ class ParquetParts:
     def __init__(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Start a file; `force` replaces it, and the parts of an unfinished one."""
         self.path = check_free(path, force=force)
-        self.folder = Path(f"{self.path}.parts")
-        """Folder of the parts."""
+        self.folder = Path(f"{self.path}.parts")  # Folder of the parts
         if self.folder.exists() and not force:
             raise InputError(
                 f"{self.folder}: parts of a run that did not end; magtwin convert reads them; give --force "

@@ -71,23 +71,12 @@ _UNITS = frozenset(unit.replace("_", "") for unit in UNITS)
 class Delimited:
     """Rows of words, all of one width."""
 
-    path: Path
-    """The file."""
-
-    names: tuple[str, ...]
-    """Names of the columns; () in a file without a header."""
-
-    rows: Sequence[Sequence[str]]
-    """Words of each row."""
-
-    lines: Sequence[int]
-    """Line of each row in the file."""
-
-    notes: tuple[str, ...] = ()
-    """What was repaired."""
-
-    comments: tuple[tuple[int, str], ...] = ()
-    """Number and text of the lines that begin with `#`."""
+    path: Path  # The file
+    names: tuple[str, ...]  # Names of the columns; () in a file without a header
+    rows: Sequence[Sequence[str]]  # Words of each row
+    lines: Sequence[int]  # Line of each row in the file
+    notes: tuple[str, ...] = ()  # What was repaired
+    comments: tuple[tuple[int, str], ...] = ()  # Number and text of the lines that begin with `#`
 
 
 def read_delimited(

@@ -74,11 +74,8 @@ class Quantity:
     """Its names, the usual one first, in lower case with low lines between words, and `|` between equals.
     Those of one place belong together in quantities of one kind, as easting and northing."""
 
-    units: Mapping[str, float]
-    """Factors to SI units or nT, by unit in lower case."""
-
-    around: frozenset[str] = frozenset()
-    """Words before or behind a name that say where it comes from."""
+    units: Mapping[str, float]  # Factors to SI units or nT, by unit in lower case
+    around: frozenset[str] = frozenset()  # Words before or behind a name that say where it comes from
 
     @cached_property
     def places(self) -> dict[str, int]:

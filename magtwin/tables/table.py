@@ -41,17 +41,10 @@ _READ = "2025-11-22T08:26:40"  # A date as an error message shows it
 class Column:
     """A column of a table."""
 
-    name: str
-    """Name; "" in a file without a header."""
-
-    cells: Any
-    """N cells: a list of texts, or an array of numbers with nan for empty cells."""
-
-    path: Path
-    """Its file."""
-
-    lines: Sequence[int] | None
-    """Line of each cell in the file; None for files without lines."""
+    name: str  # Name; "" in a file without a header
+    cells: Any  # N cells: a list of texts, or an array of numbers with nan for empty cells
+    path: Path  # Its file
+    lines: Sequence[int] | None  # Line of each cell in the file; None for files without lines
 
     def where(self, row: int) -> str:
         """File and line of a cell."""
@@ -62,14 +55,9 @@ class Column:
 class Table:
     """Columns of equal length."""
 
-    columns: tuple[Column, ...]
-    """In the order of the file or files."""
-
-    notes: tuple[str, ...] = ()
-    """What was repaired."""
-
-    comments: tuple[tuple[int, str], ...] = ()
-    """Number and text of the lines of a text that begin with `#`."""
+    columns: tuple[Column, ...]  # In the order of the file or files
+    notes: tuple[str, ...] = ()  # What was repaired
+    comments: tuple[tuple[int, str], ...] = ()  # Number and text of the lines of a text that begin with `#`
 
     @property
     def rows(self) -> int:

@@ -186,8 +186,7 @@ class _About(NamedTuple):
 
     custom: dict[str, str]
     packed: str = ""
-    kinds: Mapping[str, str] = MappingProxyType({})
-    """Message types of topics."""
+    kinds: Mapping[str, str] = MappingProxyType({})  # Message types of topics
 
 
 def _files(path: Path) -> tuple[list[Path], _About]:

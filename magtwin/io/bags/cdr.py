@@ -31,32 +31,23 @@ NS = 10**9  # Nanoseconds in a second
 class Leaf:
     """A number, stamp or string of a message, or several of them in a row."""
 
-    name: str
-    """Path in the message, such as `pose.position`."""
+    name: str  # Path in the message, such as `pose.position`
 
     kind: str
     """numpy code of a number; `time` for int32 seconds and uint32 nanoseconds; `text`; or `none` for a
     sequence that must be empty."""
 
-    count: int | None = 1
-    """How many in a row. None: a sequence, whose length stands in the message."""
+    count: int | None = 1  # How many in a row. None: a sequence, whose length stands in the message.
 
 
 @dataclass(frozen=True, eq=False)
 class Messages:
     """Messages of a topic in one buffer."""
 
-    received: Index
-    """Time of receipt of each [ns], shape (M,)."""
-
-    buffer: Bytes
-    """Bytes that hold all of them, shape (B,)."""
-
-    start: Index
-    """Offset of each in the buffer, shape (M,)."""
-
-    size: Index
-    """Bytes of each, shape (M,)."""
+    received: Index  # Time of receipt of each [ns], shape (M,)
+    buffer: Bytes  # Bytes that hold all of them, shape (B,)
+    start: Index  # Offset of each in the buffer, shape (M,)
+    size: Index  # Bytes of each, shape (M,)
 
     packed: bool = False
     """Whether they are those of ROS 1: without a header of four bytes, and without padding."""
@@ -172,11 +163,8 @@ class _Raw(NamedTuple):
     """Bytes of messages, without their headers."""
 
     buffer: Bytes
-    body: Index
-    """Offset of the first leaf of each message."""
-
-    room: Index
-    """Bytes of each from there on."""
+    body: Index  # Offset of the first leaf of each message
+    room: Index  # Bytes of each from there on
 
     packed: bool
 

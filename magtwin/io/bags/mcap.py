@@ -65,10 +65,8 @@ class McapWriter:
         self._pending = b""  # schemas and channels that the next chunk begins with
         self._chunks: list[records.ChunkIndex] = []
         self._metadata: list[records.MetadataIndex] = []
-        self.counts: dict[int, int] = {}
-        """Messages by connection."""
-        self.first, self.last = 2**63 - 1, 0
-        """Times of the first and the last message [ns]."""
+        self.counts: dict[int, int] = {}  # Messages by connection
+        self.first, self.last = 2**63 - 1, 0  # Times of the first and the last message [ns]
 
     def add(self, connection: Connection) -> None:
         """Register a topic, before its first message."""

@@ -29,14 +29,9 @@ class Connection:
 
     id: int
     topic: str
-    kind: str
-    """Message type."""
-
-    definition: str
-    """Definition of the type and of the types in it, as text."""
-
-    digest: str
-    """REP 2011 hash of the definition."""
+    kind: str  # Message type
+    definition: str  # Definition of the type and of the types in it, as text
+    digest: str  # REP 2011 hash of the definition
 
     qos: Qos
 
@@ -57,11 +52,8 @@ class Batch(NamedTuple):
     """Messages of one topic and one size, sorted by time. A topic may have several batches."""
 
     connection: Connection
-    received: Index
-    """Time of receipt [ns], shape (M,)."""
-
-    rows: Bytes
-    """One message per row, after `ROOM` free bytes, shape (M, ROOM + size)."""
+    received: Index  # Time of receipt [ns], shape (M,)
+    rows: Bytes  # One message per row, after `ROOM` free bytes, shape (M, ROOM + size)
 
     arrival: Index | None = None
     """Rank among messages with the same time, shape (M,). Default: the order of the batches."""
@@ -73,11 +65,8 @@ class StoredTopic(NamedTuple):
     id: int
     topic: str
     kind: str
-    encoding: str
-    """Encoding of its messages; "cdr" and "ros1" can be read."""
-
-    qos: str = ""
-    """Quality of service that its publishers offered, as YAML; "" if unknown."""
+    encoding: str  # Encoding of its messages; "cdr" and "ros1" can be read
+    qos: str = ""  # Quality of service that its publishers offered, as YAML; "" if unknown
 
 
 def bag_metadata(

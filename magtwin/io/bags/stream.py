@@ -32,11 +32,8 @@ class _Last:
     values: dict[str, Any] = field(default_factory=dict)
     """Its columns in the last row; empty before the first."""
 
-    changed_s: float = 0.0
-    """When they last changed [s]."""
-
-    times: int = 0
-    """How often they were sent again since."""
+    changed_s: float = 0.0  # When they last changed [s]
+    times: int = 0  # How often they were sent again since
 
 
 Sent = tuple[Topic, Index, dict[str, Any]]
@@ -64,8 +61,7 @@ class Stream:
     ) -> None:
         self._sender, self._scans, self._lab = sender, scans, lab
         self._t, self._stamp = -np.inf, -1
-        self.later_s = _later_s(run)
-        """Time by which stamps are later than t, so that none is below 0 [s]."""
+        self.later_s = _later_s(run)  # Time by which stamps are later than t, so that none is below 0 [s]
         self._last: dict[str, _Last] = {}
         columns = set(run)
         sent = [t for t in topics if t.needs and columns.issuperset(t.needs)]
@@ -82,8 +78,7 @@ class Stream:
             *[DESCRIPTION] * bool(sender.description),
             *lab,
         ]
-        self.topics = [*once, *sent, *([] if scans is None else [SCAN]), READING]
-        """Topics that are sent."""
+        self.topics = [*once, *sent, *([] if scans is None else [SCAN]), READING]  # Topics that are sent
 
     def messages(self, run: Run) -> Iterator[Sent]:
         """The messages of some rows, which have the same columns as the first and later times."""

@@ -160,8 +160,7 @@ class RawBagWriter:
         self.path, self._force = Path(path), force
         check_suffix(self.path)
         check_free(self.path, force=force)
-        self.partial = partial_of(self.path)
-        """Path until it ends."""
+        self.partial = partial_of(self.path)  # Path until it ends
         if self.partial.exists() and not force:
             raise InputError(
                 f"{self.partial}: left by a recording that did not end; read and remove it, or give --force"

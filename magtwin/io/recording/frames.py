@@ -61,14 +61,9 @@ class Mount(NamedTuple):
     """A frame at rest on the robot."""
 
     name: str
-    base: str
-    """Name of the robot's base."""
-
-    p: Array
-    """Origin of the frame in base [m], shape (3,)."""
-
-    q_xyzw: Array
-    """Axes of the frame in base, shape (4,)."""
+    base: str  # Name of the robot's base
+    p: Array  # Origin of the frame in base [m], shape (3,)
+    q_xyzw: Array  # Axes of the frame in base, shape (4,)
 
     def __str__(self) -> str:
         place = ", ".join(f"{part + 0:.3g}" for part in np.round(self.p, 4))

@@ -23,20 +23,14 @@ class Role:
     """How the topic of a role is found. Words are beginnings of words in the name of a topic."""
 
     noun: str
-    kinds: tuple[str, ...] = ()
-    """Message types of this role alone."""
-
-    named: str = ""
-    """Words that make a topic of another readable type one of the role."""
-
-    never: str = ""
-    """Words of topics that are not of the role."""
+    kinds: tuple[str, ...] = ()  # Message types of this role alone
+    named: str = ""  # Words that make a topic of another readable type one of the role
+    never: str = ""  # Words of topics that are not of the role
 
     ranks: tuple[str, ...] = ()
     """Words by rank; topics with a word of an earlier rank go before. "*" is the rank of other topics."""
 
-    option: str = ""
-    """Option that chooses. Default: --remap."""
+    option: str = ""  # Option that chooses. Default: --remap.
 
     position: str = ""
     """Column of the position of the child frame in the frame of the header, which does not move."""
@@ -44,11 +38,8 @@ class Role:
     orientation: str = ""
     """Orientation of the child frame; without `position`, of the frame of the header in the world."""
 
-    twist: tuple[str, ...] = ()
-    """Linear and angular velocity in the child frame."""
-
-    vectors: tuple[str, ...] = ()
-    """Vectors in the frame of the header, which is a part of the robot."""
+    twist: tuple[str, ...] = ()  # Linear and angular velocity in the child frame
+    vectors: tuple[str, ...] = ()  # Vectors in the frame of the header, which is a part of the robot
 
     def rank(self, name: str) -> int:
         """The rank of a topic by its name, 0 is best."""

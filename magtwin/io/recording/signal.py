@@ -20,22 +20,15 @@ STAMPS = {"header.stamp": 1, "stamp": 1, "timestamp": 1000}
 class Signal(NamedTuple):
     """The decoded messages of a topic."""
 
-    name: str
-    """Name of the topic in the bag."""
+    name: str  # Name of the topic in the bag
 
     topic: Topic
-    kind: str
-    """Message type."""
+    kind: str  # Message type
 
     messages: Messages
-    fields: dict[str, Any]
-    """Values by leaf name."""
-
-    stamps: NDArray[np.int64] | None
-    """Stamps of the messages [ns], shape (M,). None: they have none."""
-
-    broken: int = 0
-    """How many messages were left out, as they end too early or have another encoding."""
+    fields: dict[str, Any]  # Values by leaf name
+    stamps: NDArray[np.int64] | None  # Stamps of the messages [ns], shape (M,). None: they have none.
+    broken: int = 0  # How many messages were left out, as they end too early or have another encoding
 
     @property
     def received(self) -> Index:

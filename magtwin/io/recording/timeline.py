@@ -21,23 +21,12 @@ AROUND = 5  # Number of messages around one, itself included, from whose median 
 class Order(NamedTuple):
     """The messages of a topic in the order of their times."""
 
-    rows: NDArray[np.intp]
-    """Which messages are kept, in order."""
-
-    ns: Index
-    """Their times, ascending [ns]."""
-
-    sorted: int = 0
-    """How many came after a later one."""
-
-    unset: int = 0
-    """How many were left out, as their stamp is 0."""
-
-    outliers: int = 0
-    """How many were left out, as their stamp is far from those around it."""
-
-    repeated: int = 0
-    """How many have the time of the one before."""
+    rows: NDArray[np.intp]  # Which messages are kept, in order
+    ns: Index  # Their times, ascending [ns]
+    sorted: int = 0  # How many came after a later one
+    unset: int = 0  # How many were left out, as their stamp is 0
+    outliers: int = 0  # How many were left out, as their stamp is far from those around it
+    repeated: int = 0  # How many have the time of the one before
 
     def __str__(self) -> str:
         """What was done, in words; "" if nothing was."""

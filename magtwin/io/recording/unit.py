@@ -17,17 +17,10 @@ IRON = 2.0  # Factor by which iron near the sensor may change the median of the 
 class Field(NamedTuple):
     """A magnetic field in nT."""
 
-    b_nt: Array
-    """Magnitude [nT], shape (N,); nan for a message of 0, which is no field."""
-
-    vector_nt: Array | None
-    """Vector [nT], shape (N, 3). None: the messages hold a magnitude."""
-
-    label: str
-    """Unit of the messages."""
-
-    left_out: str
-    """How many messages are 0; "" if none are."""
+    b_nt: Array  # Magnitude [nT], shape (N,); nan for a message of 0, which is no field
+    vector_nt: Array | None  # Vector [nT], shape (N, 3). None: the messages hold a magnitude.
+    label: str  # Unit of the messages
+    left_out: str  # How many messages are 0; "" if none are
 
 
 def field_nt(

@@ -45,11 +45,8 @@ class Series:
     column: str
     name: str
     colour: Colour
-    part: str = ""
-    """Name of the part, such as x, of a vector column."""
-
-    width: float = 1.5
-    """Width of the line [points]. Wide lines are drawn below narrow ones."""
+    part: str = ""  # Name of the part, such as x, of a vector column
+    width: float = 1.5  # Width of the line [points]. Wide lines are drawn below narrow ones.
 
 
 _BLUE, _ORANGE, _GREEN, _GREY = (86, 156, 255), (255, 158, 64), (92, 200, 120), (165, 165, 165)
@@ -120,11 +117,8 @@ _COMPARED = (
 class Shown:
     """A run whose series are plotted."""
 
-    run: Run
-    """Its columns, and those derived for the plots."""
-
-    name: str = ""
-    """Its name among several runs; "" for a single run."""
+    run: Run  # Its columns, and those derived for the plots
+    name: str = ""  # Its name among several runs; "" for a single run
 
     colour: Colour = _ORANGE
 

@@ -183,14 +183,9 @@ class Recording:
     """One run in a stream. Append its rows, once or as they come, then close it."""
 
     rec: rr.RecordingStream
-    name: str = ""
-    """Its name among several runs; "" for a single run."""
-
-    robot: Robot | None = None
-    """Its robot in the room. None: only series."""
-
-    scans: Scans | None = None
-    """Its LiDAR scans, drawn if there is a robot."""
+    name: str = ""  # Its name among several runs; "" for a single run
+    robot: Robot | None = None  # Its robot in the room. None: only series.
+    scans: Scans | None = None  # Its LiDAR scans, drawn if there is a robot
 
     _rows: int = 0
     _last: Run | None = None

@@ -48,12 +48,10 @@ class State:
     name: str
     down: str
     up: str
-    begins: str
-    """Text of the event when the flag is raised."""
+    begins: str  # Text of the event when the flag is raised
 
     ends: str
-    level: str = "WARN"
-    """Level in Rerun's log."""
+    level: str = "WARN"  # Level in Rerun's log
 
 
 STATES: Mapping[str, State] = MappingProxyType(

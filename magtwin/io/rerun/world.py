@@ -40,8 +40,7 @@ class Scale:
 
     low_nt: float
     high_nt: float
-    table: NDArray[np.uint8]
-    """Red, green, blue, opacity in sRGB, shape (256, 4)."""
+    table: NDArray[np.uint8]  # Red, green, blue, opacity in sRGB, shape (256, 4)
 
     @classmethod
     def over(cls, field: AnomalyMap, readings_nt: Array) -> "Scale":
@@ -215,13 +214,10 @@ class Robot:
 
     rec: rr.RecordingStream
     interior: Interior
-    scale: Scale | None = None
-    """Colours of the readings along its path. None: only the path."""
+    scale: Scale | None = None  # Colours of the readings along its path. None: only the path.
     name: str = ""
-    colour: Colour = DRIVEN
-    """Colour of its path."""
-    rate_hz: float = 0.0
-    """Rows per second. 0: the rate of the first rows."""
+    colour: Colour = DRIVEN  # Colour of its path
+    rate_hz: float = 0.0  # Rows per second. 0: the rate of the first rows.
 
     _rows: int = 0
     _strides: tuple[int, int] | None = None

@@ -31,14 +31,9 @@ in a pause, and above the second usually. Fields that hardly change show no paus
 class Marks:
     """When a walker passed which places."""
 
-    t: Array
-    """Times [s], ascending, shape (M,)."""
-
-    p_xy: Array
-    """Places [m], shape (M, 2)."""
-
-    name: str
-    """Their file."""
+    t: Array  # Times [s], ascending, shape (M,)
+    p_xy: Array  # Places [m], shape (M, 2)
+    name: str  # Their file
 
 
 def marks_of(table: Table) -> Marks | None:
