@@ -47,12 +47,9 @@ class Driven:
 
 
 def driven_by(path: str) -> "str | Commands | Run":
-    """What a text tells a robot to drive: the name of a path, or a file of x,y, as it is; commands; or a run.
+    """What to drive: the name of a path, or a file of x,y, as it is; commands; or a run.
 
     A file with a header t,v,w holds commands, as does one that is no path and can be read as commands.
-
-    Raises:
-        InputError: The file is none of these.
     """
     if path in (*PATHS, *CASES, "random") or not os.path.lexists(path):
         return path
@@ -87,21 +84,11 @@ def drive(
 ) -> Driven:
     """Drive a scene's robot along a path, by commands, or as in a recorded run.
 
-    Args:
-        scene_file: The stage.
-        path: What to drive, as from `driven_by`.
-        seed: Seed of all noise.
-        session: As for `magtwin.simulate`.
-        plant: As for `magtwin.simulate`.
-        fit: Whether the path is moved and shrunk until it fits.
-        scans: Whether the LiDAR's rays are cast.
-        metadata: Metadata of the run, such as names of files that move with it.
-        report: Called with a line about each step.
-        tell: Called with a line about what is driven otherwise than it was asked for.
-        options: Of `magtwin.open_twin` and `magtwin.simulate`.
-
-    Raises:
-        InputError: As for `magtwin.simulate`, or a file cannot be read.
+    `path` is as from `driven_by`, with `fit` moved and shrunk until it fits; seed, session and plant are as
+    for `magtwin.simulate`. With `scans` the LiDAR's rays are cast. `metadata` are added to the run's, such as
+    names of files that move with it; `report` is called with a line about each step, and `tell` with one
+    about what is driven otherwise than it was asked for. `options` are those of `magtwin.open_twin` and
+    `magtwin.simulate`.
     """
     drive_input(path)  # refuses a wrong name before the scene is opened
     twin = open_twin(scene_file, **{name: options.pop(name) for name in OPENING if name in options})

@@ -40,10 +40,8 @@ class Listed:
     """What is said of some runs."""
 
     rows: list[list[Any]] = field(default_factory=list)  # Rows of runs.csv
-
     paths: dict[str, None] = field(default_factory=dict)
     sessions: dict[str, str] = field(default_factory=dict)  # Session by session and its seed
-
     driven_s: float = 0.0
     tally: Tally = field(default_factory=Tally)
 

@@ -25,8 +25,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, RepairWarning, find
-from magtwin.files.budget import BUDGETS, check_count, check_decoded, check_size, decoded_limit
-from magtwin.files.file import check_zip, existing
+from magtwin.files.budget import BUDGETS, check_count, check_decoded, decoded_limit
+from magtwin.files.file import check_zip, existing, existing_file
 from magtwin.files.outputs import check_free, output
 from magtwin.run import mapped
 from magtwin.run.arrow import (
@@ -142,11 +142,6 @@ def _read_long(path: Path, files: Sequence[Path], columns: Mapping[str, str] | N
     return run
 
 
-def _check_file(path: Path, kind: str) -> None:
-    if path.is_dir():
-        raise InputError(f"{path}: a folder, not {kind}; name the file in it")
-
-
 class ParquetParts:
     """A run that grows: each block becomes a Parquet file in the folder `F.parts`.
 
@@ -219,9 +214,8 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
     `odom_p_x`. `columns` are names in the file by names of a Run, such as `{"odom_p_x": "x"}`. A p_world_base
     without z lies on the floor.
     """
-    path = existing(path, "CSV file")
-    _check_file(path, "a CSV file")
-    size = check_size(path, "CSV")
+    path = existing_file(path, "CSV file", "CSV")
+    size = path.stat().st_size
     with open(path, "rb") as file:
         about, names, skipped = _csv_head(file, path)
         file.seek(-1, os.SEEK_END)
@@ -404,9 +398,7 @@ def _write_array(member: Any, values: NDArray[Any]) -> None:
 
 def read_npz(path: str | os.PathLike[str]) -> Run:
     """Read a run that `write_npz` wrote, to the last bit, or any npz with array names of a Run."""
-    path = existing(path, "npz file")
-    _check_file(path, "an npz file")
-    check_size(path, "npz")
+    path = existing_file(path, "npz file", "npz")
     try:
         with zipfile.ZipFile(path) as archive:
             check_zip(path, archive, "npz", "arrays")

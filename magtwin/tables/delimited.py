@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from magtwin.errors import InputError
-from magtwin.files.budget import check_size
-from magtwin.files.file import existing
+from magtwin.files.file import existing_file
 from magtwin.tables.labels import meaning_of, split_label
 from magtwin.tables.quantities import UNITS
 
@@ -98,11 +97,7 @@ def read_delimited(
     `content` are the bytes of a file that lies in an archive.
     """
     if content is None:
-        path = existing(path, noun)
-        if path.is_dir():
-            raise InputError(f"{path}: cannot be read (a folder); expected a {noun}")
-        check_size(path, "readings")
-        content = path.read_bytes()
+        content = existing_file(path, noun, "readings").read_bytes()
     path, notes = Path(path), list[str]()
     lines, ended = _lines(path, _decoded(path, content, noun, notes))
     comments, above, lines, told = _without_comments(lines, notes)

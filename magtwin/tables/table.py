@@ -268,14 +268,8 @@ def read_table(
 ) -> Table:
     """Read a table: Parquet and spreadsheets by their suffix, else text, as `magtwin.tables.delimited` does.
 
-    Args:
-        path: The file.
-        noun: What it is, for error messages.
-        wanted: What a row holds, for error messages.
-        content: The bytes of a text that lies in an archive.
-
-    Raises:
-        InputError: The file is missing, is neither, is damaged, or has no rows.
+    Errors tell its `noun`, and what a row holds, which is `wanted`. `content` are the bytes of a text in an
+    archive.
     """
     if Path(path).suffix.lower() in PARQUET:
         from magtwin.tables.parquet import parquet_columns  # imports pyarrow

@@ -52,6 +52,13 @@ class Messages:
     packed: bool = False
     """Whether they are those of ROS 1: without a header of four bytes, and without padding."""
 
+    @classmethod
+    def of(cls, received: Any, sizes: Any, content: bytes | bytearray, *, packed: bool = False) -> "Messages":
+        """Messages whose bytes follow each other, sorted by time of receipt."""
+        size, moments = np.array(sizes, np.int64), np.array(received, np.int64)
+        start = np.cumsum(size) - size
+        return cls(moments, np.frombuffer(content, np.uint8), start, size, packed).in_order()
+
     def __len__(self) -> int:
         return len(self.received)
 
@@ -165,7 +172,6 @@ class _Raw(NamedTuple):
     buffer: Bytes
     body: Index  # Offset of the first leaf of each message
     room: Index  # Bytes of each from there on
-
     packed: bool
 
     def aligned(self, at: Any, size: int) -> Any:

@@ -8,7 +8,6 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 
 from magtwin.files.budget import check_decoded
@@ -35,10 +34,10 @@ class Room:
 
     def messages(self, packed: Messages) -> Messages:
         """Decompress messages; errors as for `file`."""
-        content = [b"".join(self._parts(pa.BufferReader(raw))) for raw in _each(packed)]
-        size = np.array([len(raw) for raw in content], np.int64)
-        buffer = np.frombuffer(b"".join(content), np.uint8)
-        return Messages(packed.received, buffer, np.cumsum(size) - size, size)
+        places = zip(packed.start.tolist(), packed.size.tolist(), strict=True)
+        raws = (packed.buffer[start : start + size].tobytes() for start, size in places)
+        content = [b"".join(self._parts(pa.BufferReader(raw))) for raw in raws]
+        return Messages.of(packed.received, [len(raw) for raw in content], b"".join(content))
 
     def _parts(self, packed: pa.NativeFile) -> Iterator[bytes]:
         with pa.CompressedInputStream(packed, "zstd") as stream:
@@ -46,8 +45,3 @@ class Room:
                 self._spent += len(part)
                 check_decoded(self._path, self._size, self._spent)
                 yield part
-
-
-def _each(messages: Messages) -> Iterator[bytes]:
-    for start, size in zip(messages.start.tolist(), messages.size.tolist(), strict=True):
-        yield messages.buffer[start : start + size].tobytes()

@@ -76,12 +76,7 @@ class Db3Reader:
             times.append(received)
             sizes.append(len(data))
             contents += data
-        joined = {}
-        for number, (times, sizes, contents) in found.items():
-            size, moments = np.array(sizes, np.int64), np.array(times, np.int64)
-            buffer = np.frombuffer(contents, np.uint8)
-            joined[number] = Messages(moments, buffer, np.cumsum(size) - size, size).in_order()
-        return joined
+        return {number: Messages.of(*parts) for number, parts in found.items()}
 
     def _spent(self) -> bool:
         """Whether sqlite has to give up."""

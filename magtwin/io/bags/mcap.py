@@ -219,16 +219,10 @@ class McapReader:
     """An MCAP file: its topics, its metadata, and its messages on demand.
 
     A damaged record costs itself, and a damaged chunk its messages: records are walked through from the
-    beginning, and from a damaged one on by the index at the end of the file.
-
-    Attributes:
-        topics: Its channels.
-        notes: Metadata records by name; the last one if several have the same name.
-        definitions: Encoding and text of the definition of each message type.
-        whole: Whether the file has its end.
-        chunks: Number of its chunks.
-        compression: Names of their compressions.
-        damaged: Places of what could not be read so far.
+    beginning, and from a damaged one on by the index at the end of the file. `topics` are its channels,
+    `notes` metadata records by name, `definitions` encoding and text of message types; `whole` tells whether
+    it has its end, `compression` how its `chunks` are packed, and `damaged` the places of what could not be
+    read so far.
     """
 
     def __init__(self, path: Path) -> None:

@@ -68,7 +68,6 @@ class Sender:
     accel_std: float = 0.0  # Standard deviation of the accelerometer at rest [m/s2]
     accel_vibration: Vec3 = ZERO3  # Additional accelerometer noise per speed [1/s]
     vector_std_nt: float = 0.0  # Standard deviation of each vector axis of the magnetometer [nT]
-
     scan_rate_hz: float = 0.0
     range_m: tuple[float, float] = (0.0, 0.0)
 

@@ -32,7 +32,6 @@ class Connection:
     kind: str  # Message type
     definition: str  # Definition of the type and of the types in it, as text
     digest: str  # REP 2011 hash of the definition
-
     qos: Qos
 
     @cached_property

@@ -52,9 +52,7 @@ class Topic:
 
     name: str
     kind: str  # Message type
-
     qos: Qos = field(default_factory=Qos)
-
     needs: tuple[str, ...] = ()  # Columns without which it is not written
     carried: bool = False  # Whether a bag's reader takes the columns of `needs` from this topic
 

@@ -47,22 +47,13 @@ def write_bag(
     scans: "Scans | None" = None,
     force: bool = False,
 ) -> None:
-    """Write a run as a rosbag2; `read_bag` gives it back.
+    """Write a run, whose t ascends, as a rosbag2; `read_bag` gives it back.
 
     `magtwin.io.bags.topics.TOPICS` lists the topics and what each carries. A slower signal is sent when the
-    readings first have its value, and again while it stays. Stamps are simulation time: t = 0 is 0 ns.
-
-    Args:
-        run: The run; its t ascends from 0 or later.
-        path: The folder to make, or a single file, which ends in .mcap.
-        twin: The twin of the run: gives frames, covariances, /tf_static and the robot's description.
-        units: Unit of magnetic fields: "T", as in ROS, or "nT", as APRILab's robot publishes them.
-        scans: The LiDAR's scans.
-        force: Replace an existing bag.
-
-    Raises:
-        InputError: The path exists and `force` is not set, or cannot be written; the run has no t, its time
-            does not ascend, or a column cannot stand in a bag.
+    readings first have its value, and again while it stays. Stamps are simulation time: t = 0 is 0 ns. The
+    path is a folder to make, or a single file, which ends in .mcap. The twin gives frames, covariances,
+    /tf_static and the robot's description. `units` of magnetic fields are "T", as in ROS, or "nT", as
+    APRILab's robot publishes them.
     """
     path = Path(path)
     check_suffix(path)

@@ -101,12 +101,10 @@ def _field(bag: Bag, most: int | None, reading: Mapping[str, Any]) -> tuple[Repo
     assert recording is not None
     run, said = recording.run, recording.run.metadata
     told |= {"taken": said["taken"]} if "taken" in said else {}
-    told |= {"doubts": texts} if texts else {}
     report = _examined(run, roles, f"{said['field_unit']}, {said['field_unit_told']}")
     fit = {use: str(report.metadata[use]) for use in NEXT}
-    doubts_of_field = report.metadata.get("doubts", [])
-    if doubts_of_field:
-        told["doubts"] = [*texts, *doubts_of_field]
+    if texts := [*texts, *report.metadata.get("doubts", [])]:
+        told["doubts"] = texts
     if own:
         told["written by"] = "magtwin; magtwin report, view and reproduce take it"
     line = next((NEXT[use] for use in NEXT if fit[use].startswith("yes")), "")

@@ -48,13 +48,7 @@ TILTED_M_S2 = 0.5
 
 MOST_TRANSFORMS = 256  # Messages of more transforms are not read
 
-_TRANSFORM = (
-    "header.stamp",
-    "header.frame_id",
-    "child_frame_id",
-    "transform.translation",
-    "transform.rotation",
-)
+_TRANSFORM = ("header.stamp", *LEAVES, "transform.translation", "transform.rotation")
 
 
 class Mount(NamedTuple):

@@ -21,10 +21,8 @@ class Signal(NamedTuple):
     """The decoded messages of a topic."""
 
     name: str  # Name of the topic in the bag
-
     topic: Topic
     kind: str  # Message type
-
     messages: Messages
     fields: dict[str, Any]  # Values by leaf name
     stamps: NDArray[np.int64] | None  # Stamps of the messages [ns], shape (M,). None: they have none.

@@ -11,7 +11,6 @@ import numpy as np
 from rerun.chunk import RrdReader
 
 from magtwin.errors import InputError
-from magtwin.files.budget import check_size
 from magtwin.files.file import existing
 from magtwin.files.outputs import output
 from magtwin.io.rerun.layout import RUN_COLOURS, Shown, comparison_layout, plotted
@@ -144,13 +143,10 @@ def read_run(path: str | os.PathLike[str]) -> Run:
 def read_runs(path: str | os.PathLike[str]) -> dict[str, Run]:
     """The runs of a recording by name; a single run is called "run"."""
     path = existing(path, "recording")
-    if path.is_dir():
-        raise InputError(f"{path}: a folder; name the .rrd file in it")
-    check_size(path, "rrd")
     chunks: dict[str, list] = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # one that was cut short has no end
-        check_decodes(path, path)
+        check_decodes(path)
         try:
             for chunk in RrdReader(path).stream().filter(content=f"/{COLUMNS_ENTITY}/**").to_chunks():
                 chunks.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())

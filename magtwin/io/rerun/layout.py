@@ -119,7 +119,6 @@ class Shown:
 
     run: Run  # Its columns, and those derived for the plots
     name: str = ""  # Its name among several runs; "" for a single run
-
     colour: Colour = _ORANGE
 
     @classmethod
@@ -157,7 +156,7 @@ def layout(
     states, by default those that the run raised.
     """
     shown = Shown.of(run)
-    axis = _whole([shown])
+    axis = time_axis([run])
     stacks = {
         tab: _stacked(axis, {title: [(shown, line) for line in lines] for title, lines in plots.items()})
         for tab, plots in PLOTS.items()
@@ -189,7 +188,7 @@ def comparison_layout(
         title: [(shown, Series(column, shown.name, shown.colour, part)) for shown in runs]
         for title, column, part in _COMPARED
     }
-    side = rrb.Vertical(*_stacked(_whole(runs), plots))
+    side = rrb.Vertical(*_stacked(time_axis([shown.run for shown in runs]), plots))
     metadata = [
         rrb.TextDocumentView(origin=entity_of("metadata", shown.name), name=shown.name) for shown in runs
     ]
@@ -225,6 +224,11 @@ def _blueprint(
         eye: dict[str, Any] = {"without": "world/robot/sensors", "position": position, "target": target}
         left = rrb.Vertical(_view_3d("world", title, names, **eye), lower, row_shares=[2.0, 1.0])
         root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
+    return bare(root)
+
+
+def bare(root: Any) -> rrb.Blueprint:
+    """Views without the viewer's panels."""
     return rrb.Blueprint(
         root,
         rrb.BlueprintPanel(state="collapsed"),
@@ -233,9 +237,9 @@ def _blueprint(
     )
 
 
-def _whole(runs: Sequence[Shown]) -> rrb.TimeAxis:
+def time_axis(runs: Sequence[Run]) -> rrb.TimeAxis:
     """The axis that covers all of the runs."""
-    ends = [shown.run["t"][[0, -1]] for shown in runs]
+    ends = [run["t"][[0, -1]] for run in runs]
     first, last = (rrb.TimeRangeBoundary.absolute(seconds=float(k(ends))) for k in (np.min, np.max))
     return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
 
@@ -322,7 +326,7 @@ def _floor_view(lab: LabSpec, names: Sequence[str]) -> rrb.Spatial2DView:
         name="Map from above [m]",
         background=(24, 26, 31),
         visual_bounds=rrb.VisualBounds2D(x_range=(x0 - more, x1 + more), y_range=(y0 - more, y1 + more)),
-        overrides={entity_of("floor/paths/driven", name): _UP_TO_NOW for name in names},
+        overrides={entity_of("floor/paths/driven", name): UP_TO_NOW for name in names},
     )
 
 
@@ -331,7 +335,7 @@ def _event_view() -> rrb.TextLogView:
     return rrb.TextLogView(origin="events", name="Events", columns=shown)
 
 
-_UP_TO_NOW = rrb.VisibleTimeRanges(
+UP_TO_NOW = rrb.VisibleTimeRanges(
     rrb.VisibleTimeRange(
         TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
     )
@@ -350,7 +354,7 @@ def _view_3d(
 ) -> rrb.Spatial3DView:
     """The world in the axes of `origin`, from a position [m]; readings appear with time."""
     ends = ("world/driven", "world/readings")
-    piling_up: dict[Any, Any] = {entity_of(end, name): _UP_TO_NOW for end in ends for name in names}
+    piling_up: dict[Any, Any] = {entity_of(end, name): UP_TO_NOW for end in ends for name in names}
     return rrb.Spatial3DView(
         origin=origin,
         contents=["/world/**", f"- /{without}/**"],

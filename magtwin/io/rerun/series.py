@@ -49,7 +49,6 @@ class State:
     down: str
     up: str
     begins: str  # Text of the event when the flag is raised
-
     ends: str
     level: str = "WARN"  # Level in Rerun's log
 

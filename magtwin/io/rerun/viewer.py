@@ -93,13 +93,10 @@ def screenshot(
     recording that cannot be read or has no such moment, a size out of range, and a machine without Vulkan.
     """
     path = existing(rrd, "recording")
-    if path.is_dir():
-        raise InputError(f"{rrd}: a folder; name the .rrd file in it")
     if not (min(size) >= LEAST_SIZE and max(size) <= MOST_SIZE):
         limits = f"{LEAST_SIZE}..{MOST_SIZE} pixels each way"
         raise InputError(f"size of a recording's picture must lie in {limits}, got {size[0]} x {size[1]}")
-    check_size(path, "rrd")
-    check_decodes(path, rrd)
+    check_decodes(path)
     window = (size[0], size[1] + TITLE_BAR)
     with output(png, force=force) as aside, live_viewer(headless=True, size=window) as (_, client):
         views = _draw(client, path.resolve(), rrd, aside, time_s)
@@ -259,33 +256,32 @@ def _ending(process: "subprocess.Popen[bytes]", log: IO[str]) -> InputError:
     return InputError(f"the Rerun viewer ended: {reason}")
 
 
-def check_decodes(rrd: Path, source: str | os.PathLike[str]) -> None:
-    """Refuse a recording that Rerun's own verifier cannot decode; errors name `source`.
+def check_decodes(rrd: Path) -> None:
+    """Refuse a recording that Rerun's own verifier cannot decode.
 
     The verifier is a separate process, as changed bytes may make Rerun's decoder end its process. A missing
     end is accepted: a recording that still grows has none.
     """
+    if rrd.is_dir():
+        raise InputError(f"{rrd}: a folder; name the .rrd file in it")
+    check_size(rrd, "rrd")
+    no_recording = f"{rrd}: not a Rerun recording that can be read"
     with rrd.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
-            raise InputError(
-                f"{source}: not a Rerun recording that can be read (it does not start with RRF); "
-                "write it again"
-            )
-        _check_decoded(rrd, file, source)
+            raise InputError(f"{no_recording} (it does not start with RRF); write it again")
+        _check_decoded(rrd, file)
     command = [_binary(), "rrd", "verify", str(rrd)]
     patience = BUDGETS["rrd"].seconds + rrd.stat().st_size / 1e6
     done = run(command, limit_s=patience)
     if done.returncode == LATE:
-        raise InputError(f"{source}: Rerun does not decode it in {patience:.0f} s; write it again")
+        raise InputError(f"{rrd}: Rerun does not decode it in {patience:.0f} s; write it again")
     lines = [line for line in done.stderr.splitlines() if "Missing RRD footer" not in line and line.strip()]
     endless = done.returncode == 1 and [line.rpartition(" with ")[2] for line in lines] == ["1 errors"]
     if done.returncode and not endless:
-        raise InputError(
-            f"{source}: not a Rerun recording that can be read ({_reason(done.stderr)}); write it again"
-        )
+        raise InputError(f"{no_recording} ({_reason(done.stderr)}); write it again")
 
 
-def _check_decoded(rrd: Path, file: BinaryIO, source: str | os.PathLike[str]) -> None:
+def _check_decoded(rrd: Path, file: BinaryIO) -> None:
     """Refuse a recording whose messages, decompressed, are over the budget, by the sizes that they state.
 
     A message is kind, length and content; that of a chunk is protobuf (`ArrowMsg` of Rerun's
@@ -297,16 +293,14 @@ def _check_decoded(rrd: Path, file: BinaryIO, source: str | os.PathLike[str]) ->
         kind, length = struct.unpack("<QQ", file.read(16))
         if kind == ARROW:
             try:
-                decoded += _stated_size(file.read(min(length, size)))
+                stated = (
+                    value for number, value, _, _ in fields(file.read(min(length, size))) if number == 3
+                )
+                decoded += max(stated, default=0)
             except ValueError as error:
-                raise InputError(f"{source}: damaged recording ({error}); write it again") from error
-            check_decoded(source, size, decoded)
+                raise InputError(f"{rrd}: damaged recording ({error}); write it again") from error
+            check_decoded(rrd, size, decoded)
         at += 16 + length
-
-
-def _stated_size(message: bytes) -> int:
-    """The uncompressed size of a chunk, by its message; 0 if it states none."""
-    return max((value for field, value, _, _ in fields(message) if field == 3), default=0)
 
 
 def _binary() -> str:

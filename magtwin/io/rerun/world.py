@@ -218,7 +218,6 @@ class Robot:
     name: str = ""
     colour: Colour = DRIVEN  # Colour of its path
     rate_hz: float = 0.0  # Rows per second. 0: the rate of the first rows.
-
     _rows: int = 0
     _strides: tuple[int, int] | None = None
     _last: Run | None = None
