@@ -27,8 +27,7 @@ from magtwin.twin import Session, Twin, in_session, open_twin, room_of, scan, si
 if TYPE_CHECKING:
     from magtwin.sim.sensors.lidar import Scans
 
-IN_FOLDER = ("run.rrd", "run.parquet")
-"""Runs in a folder that is named as an output; the LiDAR's scans and a picture lie beside them."""
+IN_FOLDER = ("run.rrd", "run.parquet")  # Runs in a folder; scans and a picture lie beside them
 
 USD = (".usd", ".usda", ".usdc")
 

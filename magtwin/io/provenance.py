@@ -51,8 +51,7 @@ class Difference:
     column: str
     rows: int  # Number of rows that differ
     first: int  # The first of them
-    greatest: float
-    """Largest absolute difference in the column's unit; nan if only one of the values is known."""
+    greatest: float  # Largest absolute difference; nan if only one of the values is known
 
 
 @dataclass(frozen=True)
@@ -131,8 +130,16 @@ def made_again(
 ) -> Run:
     """Reproduce a run from its metadata, or drive the same with another engine or seed.
 
-    Arguments are those of `repeat`; `engine` is "kinematic" or "newton", by default that of the run, as is
-    the seed of all noise; `progress` is that of `magtwin.twin.engine_named`.
+    Args:
+        run: As for `repeat`.
+        scene: As for `repeat`.
+        near: As for `repeat`.
+        engine: "kinematic" or "newton". Default: the run's engine.
+        seed: Seed of all noise. Default: the run's seed.
+        progress: As for `magtwin.twin.engine_named`.
+
+    Raises:
+        InputError: As for `repeat`; or the engine is unknown or not installed.
     """
     metadata = run.metadata
     if "seed" not in metadata and seed is None:

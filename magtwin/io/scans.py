@@ -41,7 +41,11 @@ def write_scans(scans: Scans, path: str | os.PathLike[str], *, force: bool = Fal
 
 
 def read_scans(path: str | os.PathLike[str]) -> Scans:
-    """Read scans that `write_scans` wrote, to the last bit."""
+    """Read scans that `write_scans` wrote, to the last bit.
+
+    Raises:
+        InputError: The file is missing, is not Parquet, is truncated, or holds no scans.
+    """
     path = existing(path, "Parquet file of scans")
     table = load_parquet(path)
     values = {}

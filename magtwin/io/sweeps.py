@@ -222,13 +222,10 @@ class _Parts:
             raise
         took_s = max(time.monotonic() - start, 1e-9)
         said = Listed()
-        whole = True
-        for k in range(len(self.blocks)):
-            if self._part(k).exists():
-                said.extend(Listed.from_json(read_bytes(self._part(k), "part of a sweep", "JSON")))
-            else:
-                whole = False
-        if whole and self._finish(said):
+        parts = [part for part in map(self._part, range(len(self.blocks))) if part.exists()]
+        for part in parts:
+            said.extend(Listed.from_json(read_bytes(part, "part of a sweep", "JSON")))
+        if len(parts) == len(self.blocks) and self._finish(said):
             return said.report(f"{len(self.runs)} runs in {self.out}", took_s, made)
         title = f"{len(said.rows)} of {len(self.runs)} runs in {self.folder}; other shards make the rest"
         return said.report(title, took_s, made)

@@ -49,6 +49,9 @@ _ABOUT = "magtwin"  # Name of the member of an npz with the metadata, and first 
 _OWN = {("t",): ("t",), ("x", "y"): ("p_world_base_x", "p_world_base_y"), ("heading",): ("yaw",)}
 """Columns of a Run that are known by the quantity that a table of another program names."""
 
+_BROKEN = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, RuntimeError, ValueError)
+"""What zipfile and numpy raise for a damaged npz."""
+
 NUMBER = 8  # Bytes of a number in memory
 _CSV_ABOUT = 100_000  # Most lines of a CSV that begin with #; a run has one for each column, and three others
 _CSV_LINE = 1 << 20  # Longest line of a CSV [bytes]; a header of ten thousand columns is shorter
@@ -406,15 +409,7 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
             if twice := sorted(name for name, count in names.items() if count > 1):
                 raise InputError(f"{path}: two arrays are called {twice[0]!r}; write it again")
             arrays = {name.removesuffix(".npy"): _array(archive, name, path) for name in names}
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        struct.error,
-        EOFError,
-        OSError,
-        RuntimeError,
-        ValueError,
-    ) as error:
+    except _BROKEN as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: not an npz file, damaged, or cut short ({error})") from error

@@ -60,8 +60,7 @@ _Lines = list[tuple[int, str]]  # Number and text of lines
 _Rows = list[tuple[int, list[str]]]  # Line and words of rows
 
 
-_PLACED = ("x", "y", "heading")
-"""Quantities one of which a header names, if prose above it looks like another header."""
+_PLACED = ("x", "y", "heading")  # A header names one, if prose above it looks like another header
 
 _UNITS = frozenset(unit.replace("_", "") for unit in UNITS)
 

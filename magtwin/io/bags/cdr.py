@@ -48,9 +48,7 @@ class Messages:
     buffer: Bytes  # Bytes that hold all of them, shape (B,)
     start: Index  # Offset of each in the buffer, shape (M,)
     size: Index  # Bytes of each, shape (M,)
-
-    packed: bool = False
-    """Whether they are those of ROS 1: without a header of four bytes, and without padding."""
+    packed: bool = False  # Whether they are of ROS 1: without a header of four bytes and without padding
 
     @classmethod
     def of(cls, received: Any, sizes: Any, content: bytes | bytearray, *, packed: bool = False) -> "Messages":

@@ -15,8 +15,7 @@ from magtwin.files.settings import yaml_loader
 from magtwin.io.bags.cdr import Index, Messages
 from magtwin.io.bags.storage import StoredTopic
 
-_STEPS, _STEP = 1_000_000, 10_000
-"""Steps of sqlite's machine that any file may take, and those between two counts."""
+_STEPS, _STEP = 1_000_000, 10_000  # Steps of sqlite's machine that any file may take, and between counts
 
 _STEPS_PER_BYTE = 5
 """Further steps for each byte of a file. A message takes about 20 and has 20 bytes or more, but pages of a

@@ -71,9 +71,7 @@ class Sender:
     scan_rate_hz: float = 0.0
     range_m: tuple[float, float] = (0.0, 0.0)
 
-    links: tuple[FixedFrame, ...] = ()
-    """Links fixed in base_link, and sensors mounted at an angle on their links."""
-
+    links: tuple[FixedFrame, ...] = ()  # Links fixed in base_link, and sensors at an angle on their links
     wheels: tuple[FixedFrame, ...] = ()  # The wheels of `wheel_joints` at rest; empty if they are not known
     description: str = ""  # The robot's URDF; "" if unknown
 

@@ -53,9 +53,7 @@ class Batch(NamedTuple):
     connection: Connection
     received: Index  # Time of receipt [ns], shape (M,)
     rows: Bytes  # One message per row, after `ROOM` free bytes, shape (M, ROOM + size)
-
-    arrival: Index | None = None
-    """Rank among messages with the same time, shape (M,). Default: the order of the batches."""
+    arrival: Index | None = None  # Rank among messages of one time, (M,). Default: the order of the batches.
 
 
 class StoredTopic(NamedTuple):

@@ -29,15 +29,12 @@ LATEST_S = 2.0**31  # First time that ROS stamps cannot hold [s]
 class _Last:
     """State of a topic at the end of the previous rows."""
 
-    values: dict[str, Any] = field(default_factory=dict)
-    """Its columns in the last row; empty before the first."""
-
+    values: dict[str, Any] = field(default_factory=dict)  # Its columns in the last row; empty before it
     changed_s: float = 0.0  # When they last changed [s]
     times: int = 0  # How often they were sent again since
 
 
-Sent = tuple[Topic, Index, dict[str, Any]]
-"""A topic, the times of some of its messages [ns], and their fields."""
+Sent = tuple[Topic, Index, dict[str, Any]]  # A topic, times of some of its messages [ns], and their fields
 
 
 class Stream:

@@ -245,8 +245,6 @@ def _diagnosed(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
         fields |= {
             f"status.{k}.name": name,
             f"status.{k}.level": max((level for level, _ in faults), default=0),
-        }
-        fields |= {
             f"status.{k}.message": "; ".join(text for _, text in faults) or "ok",
             f"status.{k}.values": 0,
         }

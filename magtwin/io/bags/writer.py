@@ -33,9 +33,7 @@ if TYPE_CHECKING:
 CUSTOM = "magtwin."  # Prefix of a run's metadata in a bag's custom data; the values are JSON
 NOTE = "magtwin"  # Metadata record of an MCAP file that holds a run's metadata
 BLOCK = 16_384  # Rows written at a time
-
-INSIDE = "run.mcap"
-"""Name that a single storage file gives itself, so that its bytes do not depend on the one that it has."""
+INSIDE = "run.mcap"  # Name that a single file gives itself: its bytes do not depend on the one that it has
 
 
 def write_bag(
@@ -47,13 +45,22 @@ def write_bag(
     scans: "Scans | None" = None,
     force: bool = False,
 ) -> None:
-    """Write a run, whose t ascends, as a rosbag2; `read_bag` gives it back.
+    """Write a run as a rosbag2; `read_bag` gives it back.
 
     `magtwin.io.bags.topics.TOPICS` lists the topics and what each carries. A slower signal is sent when the
-    readings first have its value, and again while it stays. Stamps are simulation time: t = 0 is 0 ns. The
-    path is a folder to make, or a single file, which ends in .mcap. The twin gives frames, covariances,
-    /tf_static and the robot's description. `units` of magnetic fields are "T", as in ROS, or "nT", as
-    APRILab's robot publishes them.
+    readings first have its value, and again while it stays. Stamps are simulation time: t = 0 is 0 ns.
+
+    Args:
+        run: The run; its t ascends. Whole seconds are added to a t below 0, with a warning.
+        path: The folder to make, or a single file, which ends in .mcap.
+        twin: The twin of the run: gives frames, covariances, /tf_static and the robot's description.
+        units: Unit of magnetic fields: "T", as in ROS, or "nT", as APRILab's robot publishes them.
+        scans: The LiDAR's scans.
+        force: Replace an existing bag.
+
+    Raises:
+        InputError: The path exists and `force` is not set, or cannot be written; the run has no t, its time
+            does not ascend, or a column cannot stand in a bag.
     """
     path = Path(path)
     check_suffix(path)
@@ -144,7 +151,14 @@ class RawBagWriter:
     """A bag that grows by messages in CDR, of any topics; a killed process leaves all that was flushed.
 
     Until it ends it has another name: `run.partial.mcap` for `run.mcap`, `bag.partial` for a folder `bag`.
-    `read_bag` reads it at any time. `force` replaces a bag, and the rest of an earlier recording.
+    `read_bag` reads it at any time.
+
+    Args:
+        path: The folder to make, or a single file that ends in .mcap.
+        force: Replace an existing bag, and the rest of an earlier recording.
+
+    Raises:
+        InputError: The path exists and `force` is not set, or cannot be written.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, force: bool = False) -> None:

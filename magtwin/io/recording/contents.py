@@ -22,9 +22,7 @@ from magtwin.io.surveys.doctor import examine
 from magtwin.report.report import Figure, Report
 from magtwin.run.run import Run
 
-WHOLE = 400_000_000
-"""Bytes of the largest bag whose field is examined as a whole; of a larger one, its beginning is."""
-
+WHOLE = 400_000_000  # Bytes of the largest bag whose field is examined as a whole; else its beginning is
 BEGINNING = 100_000_000  # Bytes of the beginning of a larger bag that are examined
 FIRST = 8_000_000  # Bytes of messages from whose headers frames and delays are read
 ANOTHER_S = 3600.0  # Delays beyond this are those of another clock [s]

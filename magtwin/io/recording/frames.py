@@ -42,10 +42,7 @@ WORDS: Mapping[str, str] = {
 """Words in names of frames that stand still, of parts of a robot, and of its base; the first match counts."""
 
 TURNED_RAD, MOVED_M = 1e-6, 1e-6  # Turns [rad] and distances [m] below which a transform is none
-
-TILTED_M_S2 = 0.5
-"""Difference of the mean upward accelerations from which gravity decides what an orientation is of [m/s2]."""
-
+TILTED_M_S2 = 0.5  # Difference of mean upward accelerations by which gravity decides [m/s2]
 MOST_TRANSFORMS = 256  # Messages of more transforms are not read
 
 _TRANSFORM = ("header.stamp", *LEAVES, "transform.translation", "transform.rotation")
@@ -101,12 +98,11 @@ class StaticFrames:
         The base is base_link if the two are in one tree, else base_footprint, else another base.
         """
         name = plain(frame)
-        if name not in self.parents and all(parent != name for parent, *_ in self.parents.values()):
+        known = dict.fromkeys(chain(self.parents, (parent for parent, *_ in self.parents.values())))
+        if name not in known:
             return None
         root, p, q = self._in_root(name)
-        bases = [
-            other for other in self._names() if kind_of(other) == "base" and self._in_root(other)[0] == root
-        ]
+        bases = [other for other in known if kind_of(other) == "base" and self._in_root(other)[0] == root]
         ranks = ("base_link", "base_footprint")
         bases.sort(key=lambda other: [not other.endswith(rank) for rank in ranks])
         if not bases or name in bases:
@@ -114,10 +110,6 @@ class StaticFrames:
         _, p_base, q_base = self._in_root(bases[0])
         back = quat_conjugate(q_base)
         return Mount(name, bases[0], rotate(back, p - p_base), quat_multiply(back, q))
-
-    def _names(self) -> list[str]:
-        """All frames, each once."""
-        return list(dict.fromkeys(chain(self.parents, (parent for parent, *_ in self.parents.values()))))
 
     def _in_root(self, name: str) -> tuple[str, Array, Array]:
         """The root of a frame's tree, and the frame's origin and axes there."""

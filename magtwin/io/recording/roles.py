@@ -31,13 +31,8 @@ class Role:
     """Words by rank; topics with a word of an earlier rank go before. "*" is the rank of other topics."""
 
     option: str = ""  # Option that chooses. Default: --remap.
-
-    position: str = ""
-    """Column of the position of the child frame in the frame of the header, which does not move."""
-
-    orientation: str = ""
-    """Orientation of the child frame; without `position`, of the frame of the header in the world."""
-
+    position: str = ""  # Column of the position of the child frame in that of the header, which is still
+    orientation: str = ""  # Orientation of the child frame; without `position`, that of the header
     twist: tuple[str, ...] = ()  # Linear and angular velocity in the child frame
     vectors: tuple[str, ...] = ()  # Vectors in the frame of the header, which is a part of the robot
 
@@ -104,8 +99,7 @@ ROLES: Mapping[Topic, Role] = {
 }
 """Topics that are read from a robot's recording."""
 
-VITAL = (MAGNITUDE, POSE, ODOMETRY, VECTOR)
-"""Roles of which a fault refuses the recording. Others are left out with a warning."""
+VITAL = (MAGNITUDE, POSE, ODOMETRY, VECTOR)  # A fault of others leaves them out with a warning
 
 
 def role_of(columns: Iterable[str]) -> Role | None:

@@ -11,10 +11,7 @@ from magtwin.io.bags.cdr import NS, Index
 
 JUMP_S = 1.0  # Stamps further from those around them than this are wrong, or those of another clock [s]
 WRONG = 0.01  # Share of messages with wrong stamps up to which they are left out
-
-UNSET_NS = 10**7 * NS
-"""Median of stamps from which a stamp of 0 was not set, and is not the beginning of a simulation [ns]."""
-
+UNSET_NS = 10**7 * NS  # Median of stamps from which one of 0 was not set, and begins no simulation [ns]
 AROUND = 5  # Number of messages around one, itself included, from whose median an outlier is told
 
 

@@ -50,8 +50,19 @@ def write_rrd(
 
     Every column is stored exactly and at full rate on the timeline `sim_time`; poses are drawn at 50 Hz at
     most. The recording's id comes from the run's content, so two files of one run hold the same recording.
-    Only Rerun's own ids of chunks, rows and views differ, which `rerun rrd compare --unordered` ignores. With
-    the `twin`, its stage and map are shown, with the `planned` path and the LiDAR's `scans`.
+    Only Rerun's own ids of chunks, rows and views differ, which `rerun rrd compare --unordered` ignores.
+
+    Args:
+        run: The run.
+        path: The .rrd file to make.
+        twin: Where the run took place: its stage and its map are shown. None: only series.
+        planned: The planned path, or None.
+        scans: LiDAR scans, drawn as points in world, or None.
+        force: Whether to replace an existing file.
+
+    Raises:
+        InputError: The file exists and `force` was not given or it cannot be written, the stage cannot be
+            read, or the run has no rows.
     """
     _check_rows(run, path)
     name, size = title_of(run) or FilePath(path).stem, size_of(run, scans)

@@ -24,9 +24,7 @@ from magtwin.sim.sensors.lidar import Scans
 from magtwin.twin import Twin
 
 TICK_S = 0.05  # Time between blocks of a run that is shown in step with the clock [s]
-
-Show = Callable[[float, tuple[float, float, float]], None]
-"""Takes the time [s] and x [m], y [m], yaw [rad] of base_link."""
+Show = Callable[[float, tuple[float, float, float]], None]  # Takes t [s] and x, y [m], yaw [rad]
 
 
 def play(

@@ -31,8 +31,7 @@ BLOCK = 4096
 """Rows per chunk: few enough for the viewer to skip what it does not show, and for LZ4, with its window of
 64 kB, to compress the repeated offsets of the lists."""
 
-COLUMNS_ENTITY, DERIVED_ENTITY = "run", "derived"
-"""Entities of the columns of a run, and of further lines of the plots."""
+COLUMNS_ENTITY, DERIVED_ENTITY = "run", "derived"  # Entities of columns, and of other lines
 
 FACTS, NAMES, NAME, ROWS = "magtwin_facts", "magtwin_columns", "magtwin_name", "magtwin_rows"
 """Components without time: metadata and columns as JSON, the name of the run among several, and the number of

@@ -32,21 +32,11 @@ from magtwin.parallel.machine import end_group, ends_with_parent
 LOCALHOST = "127.0.0.1"
 
 MAGIC = b"RRF"  # First bytes of a recording, before its format number
-
-HEADER, ARROW = 12, 2
-"""Bytes of a recording before its first message, and the kind of messages that hold chunks."""
-
-LEAST_SIZE, MOST_SIZE = 200, 8000
-"""Least and greatest side of a picture: room for the views, and the limit of a texture [pixels]."""
-
-PATIENCE_S = 600.0
-"""Time that a viewer that lives may take for a step, on a busy machine without a graphics card [s]."""
-
-LATE_S = 5.0
-"""Time after which an answer that did not come is late: Rerun's client waits for each for 15 s [s]."""
-
-FRAMES = 20
-"""Frames after which a loaded file has shown something, and after which the viewer's notices are gone."""
+HEADER, ARROW = 12, 2  # Bytes before the first message, and the kind of messages that hold chunks
+LEAST_SIZE, MOST_SIZE = 200, 8000  # Sides of a picture: room for the views, limit of a texture [pixels]
+PATIENCE_S = 600.0  # Time that a living viewer may take for a step, without a graphics card [s]
+LATE_S = 5.0  # Time after which no answer is a late one: Rerun's client waits for 15 s [s]
+FRAMES = 20  # Frames after which a loaded file shows something, and notices are gone
 
 CANNOT_DRAW = re.compile(r"render context|adapter|graphics|wgpu|surface", re.IGNORECASE)
 """Words of a viewer that ended because it cannot draw."""
@@ -55,9 +45,7 @@ VULKAN = "without a graphics card it needs Vulkan in software: apt install mesa-
 """What to do then."""
 
 TITLE_BAR = 36  # Height of the viewer's empty title bar [pixels]
-
-TOASTS_S, NOTHING_S = 6.0, 10.0
-"""Time until the viewer's own notices have disappeared, and until a loaded file shows something [s]."""
+TOASTS_S, NOTHING_S = 6.0, 10.0  # Times until the viewer's notices are gone, and a file shows something [s]
 
 
 def show(rrd: str | os.PathLike[str], *, source: str | os.PathLike[str] | None = None) -> None:
@@ -293,10 +281,8 @@ def _check_decoded(rrd: Path, file: BinaryIO) -> None:
         kind, length = struct.unpack("<QQ", file.read(16))
         if kind == ARROW:
             try:
-                stated = (
-                    value for number, value, _, _ in fields(file.read(min(length, size))) if number == 3
-                )
-                decoded += max(stated, default=0)
+                message = file.read(min(length, size))
+                decoded += max((value for field, value, _, _ in fields(message) if field == 3), default=0)
             except ValueError as error:
                 raise InputError(f"{rrd}: damaged recording ({error}); write it again") from error
             check_decoded(rrd, size, decoded)

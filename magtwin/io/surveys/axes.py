@@ -10,10 +10,7 @@ Array = NDArray[np.float64]
 
 TURNED = 0.7  # Length of the mean unit vector of the headings above which a survey hardly turned
 ALIGNED = 0.8  # Ratio of the mean level field to its size above which it keeps one direction
-
-CLEARLY = 0.3
-"""Difference of these ratios from which headings or vectors are mirrored. Hard iron does not look so."""
-
+CLEARLY = 0.3  # Difference of these ratios from which one is mirrored. Hard iron does not look so.
 LEAST_READINGS = 8  # Fewest readings from which headings are judged
 
 

@@ -20,10 +20,7 @@ Array = NDArray[np.float64]
 FILTER_HZ = 5.0  # Rate at which the localizers read the field [Hz]
 SECTORS = 12  # Sectors of 30 degrees in which headings are counted
 LEAST_READINGS, LEAST_SPAN_M = 100, 0.5  # Fewest readings and least extent [m] of a map
-
-LEAST_SECTORS = 6
-"""Fewest sectors from which the hard iron is estimated, and from which a robot's own field can be told."""
-
+LEAST_SECTORS = 6  # Fewest sectors for the hard iron, and for a robot's own field
 STEPS = 0.02  # Largest distance from a whole number of steps, in steps, of a value that a sensor rounded
 
 USES = {

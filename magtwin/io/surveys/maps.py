@@ -123,13 +123,7 @@ def _fitted(
 
     doubts = [*_doubts(readings), *_shared(readings, method)]
     model = fit(readings, method, progress=progress, **options)
-    field = raster(
-        model,
-        readings,
-        spacing_m=spacing_m,
-        headings_rad=headings_rad,
-        progress=progress,
-    )
+    field = raster(model, readings, spacing_m=spacing_m, headings_rad=headings_rad, progress=progress)
     save_map(field, out, force=force)
     report = _with_doubts(report, [*doubts, *_masked(field)])
     return _joined(field.report(), choice_report(field.parameters), grid_report(field), report)

@@ -5,8 +5,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-AXIS_M, FLATTENING = 6_378_137.0, 1 / 298.257223563
-"""Semi-major axis and flattening of WGS 84 (NIMA TR8350.2, table 3.1)."""
+AXIS_M, FLATTENING = 6_378_137.0, 1 / 298.257223563  # WGS 84 (NIMA TR8350.2, table 3.1)
 
 
 def on_tangent_plane(lat_deg: Array, lon_deg: Array) -> tuple[Array, str]:

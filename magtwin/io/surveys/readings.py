@@ -45,10 +45,10 @@ def read_readings(
 
     A source is a folder of one CSV per heading (`magtwin.field.survey.folder`); a table of readings, CSV or
     Parquet or a spreadsheet; a log of a phone or vehicle (`magtwin.io.surveys.logs`); several files with
-    matching rows, joined by `+` (`1-time.csv+1-loc.csv+1-mag.csv`; the others are
-    searched for beside the first); the Parquet of a Run or of Readings; or a rosbag2, as a folder or a
-    storage file. Several sources are several runs of one survey, as are the files of a pattern
-    (`drives/*.parquet`) and the Parquet files of a folder, in the order of their names.
+    matching rows, joined by `+` (`1-time.csv+1-loc.csv+1-mag.csv`; the others are beside the first); the
+    Parquet of a Run or of Readings; or a rosbag2, as a folder or a storage file. Several sources are several
+    runs of one survey, as are the files of a pattern (`drives/*.parquet`) and the Parquet files of a folder,
+    in the order of their names.
 
     Args:
         sources: One or more sources.
