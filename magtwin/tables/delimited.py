@@ -108,7 +108,8 @@ def read_delimited(
     rows = _words(path, lines[prose:], between)
     first = _header(rows)
     if prose or first:
-        notes.append(f"line {rows[first][0]} as the header, and the lines above it as prose")
+        what = "header" if _is_header(rows[first][1]) else "first row"
+        notes.append(f"line {rows[first][0]} as the {what}, and the lines above it as prose")
     above = [comment for comment in above if comment[0] < rows[first][0]]
     names, rows = _names(path, rows[first:], above, between)
     if not rows:
@@ -208,7 +209,8 @@ def _names(path: Path, rows: _Rows, above: _Lines, between: str | None) -> tuple
     if _is_header(rows[0][1]):
         return [word.strip() for word in rows[0][1]], rows[1:]
     names: list[str] = []
-    for comment, mark in itertools.product(above, dict.fromkeys((between, *",;\t", None))):
+    marks = [*dict.fromkeys((between or ",", *",;\t", None))]  # the first that fits counts
+    for comment, mark in itertools.product(above, reversed(marks)):
         with suppress(InputError):  # prose with unpaired quotes
             ((_, header),) = _words(path, [comment], mark)
             names = [word.strip() for word in header] if len(header) == len(rows[0][1]) else names
@@ -322,7 +324,8 @@ def _blanks(lines: Sequence[str]) -> tuple[None, int] | None:
     words = [line.split() for line in lines]
     rows = [len(row) == len(words[-1]) > 1 and all(math.isfinite(number_of(w)) for w in row) for row in words]
     above = rows.index(True) if True in rows else len(rows)
-    return (None, above) if all(rows[above:]) and 0 < above < min(MOST_ABOVE, len(rows) - 1) else None
+    above -= 0 < above < len(rows) and len(words[above - 1]) == len(words[-1])  # a header
+    return (None, above) if all(rows[above + 1 :]) and 0 < above < min(MOST_ABOVE, len(rows) - 1) else None
 
 
 def _mark(lines: Sequence[str]) -> tuple[str | None, int] | None:
