@@ -21,7 +21,7 @@ PACKAGE = ROOT / "magtwin"
 PAGE = ROOT / "ARCHITECTURE.md"
 
 FILES = {
-    "scene_to_recording": 130,
+    "scene_to_recording": 134,
     "survey_to_map": 60,
     "recordings_to_network": 62,
     "localizer_to_row": 105,

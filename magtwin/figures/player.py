@@ -42,7 +42,13 @@ R_90 = math.sqrt(-2 * math.log(1 - 0.9))
 
 CHARTS: tuple[dict[str, Any], ...] = (
     {"title": "Field", "unit": "µT", "scale": 0.01, "digits": 2, "lines": ("reading", "map")},
-    {"title": "Robot's own field", "unit": "nT", "scale": 1, "digits": 0, "lines": ("own", "predicted")},
+    {
+        "title": "Robot's own field",
+        "unit": "nT",
+        "scale": 1,
+        "digits": 0,
+        "lines": ("own", "predicted by the network"),
+    },
     {"title": "Error", "unit": "nT", "scale": 1, "digits": 0, "lines": ("error",), "band": "band"},
     {"title": "Position error", "unit": "m", "scale": 0.001, "digits": 3, "lines": ("off", "est_a")},
 )
@@ -194,7 +200,7 @@ def columns_of(run: Run, rows: Any, start_s: float) -> tuple[dict[str, Array], d
         add("own", judge - field)
         predicted = prediction_nt(run)[rows] if "b_total_nt" in run else judge
         if np.any(np.nan_to_num(predicted - field)) and np.any(np.nan_to_num(predicted - judge)):
-            add("predicted", predicted - field)
+            add("predicted by the network", predicted - field)
             add("error", predicted - judge)
             add("band", None if sd is None else Z_90 * sd)
     estimate, off = get("est_p_world_base"), off_m(run)

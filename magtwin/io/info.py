@@ -28,7 +28,11 @@ def info_of(path: str | os.PathLike[str], **reading: Any) -> Report:
     if is_bag(file):
         from magtwin.io.recording.contents import info_of_bag
 
-        return info_of_bag(file, **reading)
+        report = info_of_bag(file, **reading)
+        if "written by" not in report.metadata:
+            return report
+        run = info_of_run(file, **reading)
+        return replace(run, metadata={**run.metadata, "topics": report.metadata["topics"]})
     if file.is_dir() and not is_survey(file):
         return (
             map_metadata(read_survey(file)[0])

@@ -31,8 +31,7 @@ IN_FOLDER = ("run.rrd", "run.parquet")  # Runs in a folder; scans and a picture 
 
 USD = (".usd", ".usda", ".usdc")
 
-OPENING = ("lab", "map_layer", "network", "magnetometer", "model_error", "tracking_error")
-"""Options of `magtwin.open_twin`."""
+OPENING = ("lab", "map_layer", "network", "magnetometer", "model_error", "tracking_error")  # Of `open_twin`
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ LEAST_ROWS = 8  # Rows from which a last number can be told to be cut short
 LOST = 5.0  # Factor below all others from which a number is cut short; a lost digit makes it a tenth
 
 MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "*", "#na", "#nv", "#n/a"}
+MISSING |= {"\N{EM DASH}", "\N{EN DASH}"}
 """Words for a missing value, in lower case; `*` is that of Geosoft. Spreadsheets also write errors for them,
 such as #DIV/0!."""
 
@@ -42,6 +43,20 @@ _THOUSANDS = re.compile(
 )
 """A number with marks between its thousands: English commas, Swiss apostrophes or French blanks."""
 
+_MOMENT = re.compile(
+    r"\s*(\d{1,4}[-/.]\d{1,2}[-/.]\d{1,4}\D?)?(\d{1,3}:\d\d(:\d\d)?(\.\d*)?\S*)?\s*", re.ASCII
+)
+"""A date, a time, or both."""
+
+_COMPASS = re.compile(r"(\d+(?:\.\d*)?)([EWNS])", re.ASCII)
+"""A number with the direction in which it counts, as of GEM's magnetometers: 00005.400E."""
+
+_SUMMARY = re.compile(
+    r"\s*(mean|average|avg|sum|total|min|max|std|median|mittel\w*|summe|moyenne|somme|media|promedio|suma)\b",
+    re.IGNORECASE,
+)
+"""Begin of a row below a table that sums it up."""
+
 _BELOW_1000 = re.compile(r"\s*[+-]?\d{1,3}([.,]\d*)?\s*", re.ASCII)
 
 _BEGUN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d*)?([eE][+-]?)?", re.ASCII)  # The begin of a number
@@ -49,11 +64,10 @@ _BEGUN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d*)?([eE][+-]?)?", re.ASCII)  # The b
 _SLASH = re.compile(r"\s*/([^\w,;]|\w+\s|$)")
 """A comment line of Geosoft's XYZ, and no word that begins with a slash, such as a topic of ROS."""
 
-_TRACK = re.compile(r"\s*(line|tie)\s+(?=\S*\d)\S+\s*", re.IGNORECASE)
-"""A line of Geosoft's XYZ that begins a survey line."""
-
+_TRACK = re.compile(r"\s*(line|tie)\s+(?=\S*\d)\S+\s*", re.IGNORECASE)  # Begins a survey line of Geosoft
 _REMARK = re.compile(r"\s*#\s*\w+:\s")  # A comment line `# KEY: VALUE`, as in maps written as CSV
 
+_BRACKET = re.compile(r"[\[(]")
 _ERROR = re.compile(r"\s*#(n/?a|nv|value!|div/0!|ref!|num!|name\?|null!)\s*", re.IGNORECASE)
 _CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f]")  # Characters that no text has
 _Lines = list[tuple[int, str]]  # Number and text of lines
@@ -153,8 +167,10 @@ def _is_number(word: str) -> bool:
 
 
 def _is_text(word: str) -> bool:
-    """Whether a word is neither a number nor missing."""
-    return math.isinf(number_of(word)) and not _is_number(word)
+    """Whether a word is no number, date or time, and not missing."""
+    if not math.isinf(number_of(word)) or _is_number(word):
+        return False
+    return not (_MOMENT.fullmatch(word) or _COMPASS.fullmatch(word.strip()))
 
 
 def _is_header(words: list[str]) -> bool:
@@ -195,13 +211,16 @@ def _last(rows: _Rows, width: int, ended: bool, blanks: bool) -> str:
     words = [word for word in row if word.strip()]
     if not ended and len(row) < width:
         return f"as cut short and left out: it has no end, and {len(row)} of {width} values"
+    if any(_SUMMARY.match(word) and _is_number(above) for word, above in zip(row, rows[-2][1], strict=False)):
+        return f"as a summary and left out: {' '.join(words)[:QUOTED]!r}"
     alone = width > 1 and (blanks or len(words) == 1) and all(map(_is_text, words))
     below = len(row) != width or _is_number(rows[-2][1][0])
     return f"as prose and left out: {' '.join(words)[:QUOTED]!r}" if alone and below else ""
 
 
 def _is_unit(word: str) -> bool:
-    return split_label(f"x [{word.strip(' []()')}]").unit.replace("_", "") in _UNITS
+    unit = word.strip(" []()")
+    return not _BRACKET.search(unit) and split_label(f"x [{unit}]").unit.replace("_", "") in _UNITS
 
 
 def _names(path: Path, rows: _Rows, above: _Lines, between: str | None) -> tuple[list[str], _Rows]:
@@ -322,7 +341,7 @@ def _separator(lines: _Lines) -> tuple[str | None, int]:
 def _blanks(lines: Sequence[str]) -> tuple[None, int] | None:
     """Number of lines of prose above rows of numbers with blanks between; None if these are no such rows."""
     words = [line.split() for line in lines]
-    rows = [len(row) == len(words[-1]) > 1 and all(math.isfinite(number_of(w)) for w in row) for row in words]
+    rows = [len(row) == len(words[-1]) > 1 and not any(map(_is_text, row)) for row in words]
     above = rows.index(True) if True in rows else len(rows)
     above -= 0 < above < len(rows) and len(words[above - 1]) == len(words[-1])  # a header
     return (None, above) if all(rows[above + 1 :]) and 0 < above < min(MOST_ABOVE, len(rows) - 1) else None
@@ -366,7 +385,12 @@ def _words(path: Path, lines: _Lines, between: str | None) -> _Rows:
 
 
 def _plain_numbers(names: list[str], rows: list[list[str]], between: str | None, notes: list[str]) -> None:
-    """Take marks between thousands out of the rows, and make decimal commas points."""
+    """Take marks between thousands and directions out of the rows, and make decimal commas points."""
+    for column in range(len(rows[0])):
+        found = [_COMPASS.fullmatch(row[column].strip()) for row in rows]
+        if all(found):
+            for row, match in zip(rows, found, strict=True):
+                row[column] = ("-" if match and match[2] in "WS" else "") + (match[1] if match else "")
     if columns := _without_thousands(rows):
         named = ", ".join(names[k] if names else str(k + 1) for k in columns)
         notes.append(f"numbers of {named[:QUOTED]} with marks between thousands")

@@ -94,7 +94,7 @@ _AT = (
     "coordonnee coordenada coordinata proj"
 )
 _ON_EARTH = "location gps gnss geo wgs84 pos position decimal dd"
-_READINGS = "strength value reading raw sensor measured calibrated avg mean corrected"
+_READINGS = "strength value reading raw sensor measured calibrated avg mean corrected cor"
 _SENT = "twist cmd vel msg data header"
 _VECTORS = (
     "b{} b_{} m{} mag_{} mag{} field_{} magnetic_field_{} mag_field_{} magnetometer_{} magnetfeld_{} "

@@ -31,7 +31,7 @@ _EPOCHS = ((1e17, 1e9, "ns"), (1e14, 1e6, "us"), (1e11, 1e3, "ms"))
 """Least median of times since 1970, ticks per second and unit; below them are seconds."""
 
 _DATE = re.compile(r"\d{1,4}[-/.](\d{1,2}|[A-Za-z]{3})[-/.]\d{1,4}", re.ASCII)
-_CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:\.\d*)?))?", re.ASCII)
+_CLOCK = re.compile(r"\d{1,3}(:\d\d){1,2}(\.\d*)?", re.ASCII)
 _DAYS = ("%Y-%m-%d", "%d-%m-%Y", "%m-%d-%Y", "%d-%b-%Y")  # Orders of a date, with a hyphen for any mark
 _CLOCKS = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")  # Times behind a date
 _READ = "2025-11-22T08:26:40"  # A date as an error message shows it
@@ -180,9 +180,8 @@ class Table:
         column = self.column(name)
         is_text = not isinstance(column.cells, np.ndarray) or column.cells.dtype.kind == "O"
         texts = self.texts(name) if is_text else []
-        if texts and all(clocks := [_CLOCK.fullmatch(text) for text in texts]):
-            seconds = np.array([3600 * int(m[1]) + 60 * int(m[2]) + float(m[3] or 0) for m in clocks if m])
-            return seconds + 86_400.0 * np.cumsum(np.diff(seconds, prepend=seconds[0]) < -43_200)
+        if texts and all(map(_CLOCK.fullmatch, texts)):
+            return _of_day([[float(part) for part in text.split(":")] for text in texts])
         if not any(map(_DATE.match, texts)):
             for row, text in enumerate(texts):
                 if np.isinf(number_of(text)):
@@ -228,6 +227,14 @@ def since_1970(table: Table, name: str) -> tuple[Array, str]:
 def _and(names: Sequence[str]) -> str:
     """Names in a line: `t, v and w`."""
     return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)[: 3 * QUOTED]
+
+
+def _of_day(clocks: Sequence[list[float]]) -> Array:
+    """Seconds of times of day, beyond midnight too; or of m:ss, which begin at 0 or have fractions."""
+    minutes = len(clocks[0]) == 2 and (clocks[0][0] == 0 or any(clock[1] % 1 for clock in clocks))
+    weights = (60.0, 1.0) if minutes else (3600.0, 60.0, 1.0)
+    seconds = np.array([sum(w * part for w, part in zip(weights, clock, strict=False)) for clock in clocks])
+    return np.asarray(seconds + 86_400.0 * np.cumsum(np.diff(seconds, prepend=seconds[0]) < -43_200))
 
 
 def _reader(day: str) -> Callable[[str], datetime]:

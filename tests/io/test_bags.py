@@ -460,7 +460,7 @@ def test_a_chunk_that_says_it_is_a_thousand_times_its_size_is_refused_unread(bag
     chunk = content.index(b"zstd") - 4 - 4 - 8  # its size stands before checksum and codec
     content[chunk : chunk + 8] = (1 << 29).to_bytes(8, "little")
     (tmp_path / "run.mcap").write_bytes(content)
-    with pytest.warns(RepairWarning, match="1 of 4 chunks or records are damaged and are left out"):
+    with pytest.warns(RepairWarning, match=r"1 of \d chunks or records are damaged"):
         run = read_bag(tmp_path / "run.mcap")
     assert 0 < run.rows < read_bag(bags / "run.mcap").rows
 

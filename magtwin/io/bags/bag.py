@@ -27,9 +27,7 @@ from magtwin.io.bags.writer import CUSTOM, NOTE
 from magtwin.run.arrow import check_metadata
 from magtwin.run.run import Metadata
 
-SUFFIXES: dict[str, Any] = {".mcap": McapReader, ".db3": Db3Reader, ".bag": Ros1Reader}
-"""Readers of storage files, by suffix."""
-
+SUFFIXES: dict[str, Any] = {".mcap": McapReader, ".db3": Db3Reader, ".bag": Ros1Reader}  # Readers by suffix
 LONGEST_LINE = 2000  # Most characters of an error message
 
 
@@ -63,8 +61,8 @@ class Bag:
             if not (all(reader.whole for reader in self.readers) or PARTIAL in self.path.name):
                 text = "cut short: its end is missing; it is read up to its last whole chunk"
                 warnings.warn(f"{self.path}: {text}", RepairWarning, stacklevel=2)
+            self._tell()
             self._opened = opened.pop_all()
-        self._tell()
 
     def _take(self, reader: "McapReader | Db3Reader | Ros1Reader", kinds: Mapping[str, str]) -> None:
         """The topics, types and metadata of a storage file."""

@@ -33,16 +33,11 @@ MAGIC = b"\x89MCAP0\r\n"
 CHUNK = 1 << 20  # Approximate bytes of a chunk before compression
 LARGEST_CHUNK = BUDGETS["bag"].count  # Largest chunk that is read [bytes]
 MOST_RATIO = 1000  # Largest compression ratio that is accepted, beyond `SPARE`
-
-SPARE = 1 << 26
-"""Bytes that the chunks of a file may hold beyond `MOST_RATIO`: blank images compress to almost nothing."""
-
+SPARE = 1 << 26  # Bytes that chunks may hold beyond `MOST_RATIO`: blank images compress to almost none
 LEVEL = 1  # Compression level of zstd
 FOOTER = 29  # Bytes of the record that ends a file
 PRIVATE = 0x80  # Opcodes from which a record is of no concern
-
-_DAMAGED = (ValueError, struct.error, McapError, IndexError, OverflowError)
-"""What the library raises for a damaged record."""
+_DAMAGED = (ValueError, struct.error, McapError, IndexError, OverflowError)  # Raised for damaged records
 
 _HEAD = struct.Struct("<BQ")
 _RECORD = struct.Struct("<BQH")  # Opcode and length of a record, and the channel of a message
@@ -255,16 +250,10 @@ class McapReader:
             self.close()
             raise
         self.chunks = len(self._chunks)
-        self.topics = [
-            StoredTopic(
-                c.id,
-                c.topic,
-                self._schemas.get(c.schema_id, ""),
-                c.message_encoding,
-                c.metadata.get("offered_qos_profiles", ""),
-            )
-            for c in self._channels.values()
-        ]
+        self.topics: list[StoredTopic] = []
+        for c in self._channels.values():
+            kind, qos = self._schemas.get(c.schema_id, ""), c.metadata.get("offered_qos_profiles", "")
+            self.topics.append(StoredTopic(c.id, c.topic, kind, c.message_encoding, qos))
 
     def close(self) -> None:
         """Close the file."""

@@ -42,8 +42,9 @@ class Sender:
     map_frame: str = "map"
     odom_frame: str = "odom"
     base_frame: str = "base_link"
-    truth_frame: str = "ground_truth"
-    """Frame at the true pose of base_link, in the map; on /tf if the map is not the parent of odom."""
+    truth_frame: str = (
+        "ground_truth"  # True pose of base_link in the map; on /tf if that is not odom's parent
+    )
 
     imu_frame: str = "imu_link"
     magnetometer_frame: str = "magnetometer_link"
@@ -58,10 +59,7 @@ class Sender:
     """Transforms of the drive on /tf. With "all", map to odom puts base_link at its true pose."""
 
     unit: Unit = "T"  # Unit of magnetic fields in messages
-
-    odometry_std: tuple[float, ...] = (0.0,) * 6
-    """Standard deviation of odometry's velocities, linear [m/s] and angular [rad/s]."""
-
+    odometry_std: tuple[float, ...] = (0.0,) * 6  # Of odometry's velocities, [m/s] and [rad/s]
     orientation_std: float = 0.0  # Standard deviation of each small angle of the IMU's orientation [rad]
     gyro_std: float = 0.0  # Standard deviation of the gyroscope at rest [rad/s]
     gyro_vibration: Vec3 = ZERO3  # Additional gyroscope noise per speed [rad/m]

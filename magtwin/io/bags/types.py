@@ -13,8 +13,7 @@ _CODES |= {f"{sign}int{8 * size}": f"{sign[:1] or 'i'}{size}" for sign in ("u", 
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 """Types of stamps, one leaf of whole nanoseconds."""
 
-MOST_TEXT, MOST_LEAVES, DEEPEST = 200_000, 20_000, 30
-"""Limits of a definition in a bag: characters, parts, and depth of structures."""
+MOST_TEXT, MOST_LEAVES, DEEPEST = 200_000, 20_000, 30  # Of a definition: characters, parts, depth
 
 
 @cache

@@ -34,7 +34,8 @@ Frames = tuple[str, str]  # Frame of the header and child frame of a message; ""
 LEAVES = ("header.frame_id", "child_frame_id")
 
 WORDS: Mapping[str, str] = {
-    "fixed": "map odom world earth enu ned utm origin local global vicon mocap optitrack qualisys qtm",
+    "fixed": "map vision takeoff odom world earth enu ned utm origin local global vicon mocap optitrack "
+    "qualisys qtm",
     "part": "camera cam optical imu gyro accel lidar laser scan rplidar velodyne depth radar sonar gps gnss "
     "mag magnetometer compass antenna sensor wheel",
     "base": "base footprint body chassis robot",

@@ -50,9 +50,10 @@ ROLES: Mapping[Topic, Role] = {
     MAGNITUDE: Role(
         noun="field",
         kinds=(MAGNITUDE.kind, "px4_msgs/msg/VehicleMagnetometer", "px4_msgs/msg/SensorMag"),
-        named="mag compass field bfield b_field tesla gauss qtfm",
-        never="bias offset covariance calib heading hdg temp status std error gain declination image",
-        ranks=("magnitude total scalar norm", "*", "raw uncal"),
+        named="mag compass field bfield b_field tesla gauss qtfm fluxgate",
+        never="bias offset covariance calib heading hdg temp status std error gain declination image "
+        "sensitivity gyro accel acceleration velocity force",
+        ranks=("magnitude total scalar", "*", "raw uncal"),
         option="--field-topic",
         vectors=("magnetic_field",),
     ),
@@ -139,7 +140,8 @@ def chosen(role: Topic, names: Collection[str], near: str = "") -> list[str]:
     space = near.strip("/").split("/")[0]
     inside = [name for name in best if space and name.strip("/").split("/")[0] == space]
     usual = [name for name in best if name.rpartition("/")[2] == role.name.rpartition("/")[2]]
-    for fewer in (inside, usual):
+    robots = [name for name in best if _has(name, "robot base body vehicle rover")]
+    for fewer in (inside, usual, robots if role is POSE else []):
         if len(best) > 1 and len(fewer) == 1:
             best = fewer
     return best

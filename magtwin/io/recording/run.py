@@ -223,8 +223,8 @@ class Recording:
         """
         frame = self._frames(odometry)[0]
         way = self.tree.up(frame) if frame else []
-        if len(way) < 2 or odometry.stamps is None:
-            return None
+        if len(way) < 2 or kind_of(way[-1]) == "base" or odometry.stamps is None:
+            return None  # a robot whose body is the root moves the world
         p, q = self.tree.at(frame, odometry.stamps)
         far = float(np.hypot(p[:, 0], p[:, 1]).max())
         turn = float(np.abs(yaw_from_quat(q)).max())

@@ -96,11 +96,11 @@ class Tree:
         A frame `near` on the robot decides between several robots, which are refused else.
         """
         names = {*self.moving, *self.static.parents}
-        found = [name for name in names if kind_of(name) == "base" and self._moves(name)]
+        ways = {name: self.up(name) for name in names if kind_of(name) == "base"}
+        found = [n for n, way in ways.items() if kind_of(way[-1]) == "fixed" and {*way} & self.moving.keys()]
         if near:
-            found = [
-                name for name in found if set(self.up(near)) & set(self.up(name)) & {*self.moving}
-            ] or found
+            above = {*self.up(near)} & self.moving.keys()
+            found = [name for name in found if above & {*ways[name]}] or found
         for rank in ("base_link", "base_footprint", ""):
             if best := sorted(name for name in found if name.endswith(rank)):
                 if len(best) > 1 and rank:
@@ -109,10 +109,6 @@ class Tree:
                     )
                 return best[0]
         return ""
-
-    def _moves(self, name: str) -> bool:
-        way = self.up(name)
-        return kind_of(way[-1]) == "fixed" and any(each in self.moving for each in way)
 
     def stamps(self, frame: str) -> Index:
         """Times of the transforms of the edge above a frame that has most [ns]."""

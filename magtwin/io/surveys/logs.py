@@ -7,6 +7,7 @@ of the field gets the places of the others, joined by time.
 import re
 import zipfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,10 +32,7 @@ ACCELERATION = ("accelerometer", "acceleration", "acc", "accel", "linear")
 """Words in the names of the tables of a log."""
 
 MOST_PARTS = 200  # Most tables of a log
-
-_TRACE = re.compile(rb"^\d+\tTYPE_[A-Z_]+\t", re.M)
-"""A line of a trace of an Android phone: time [ms], sensor, values."""
-
+_TRACE = re.compile(rb"^\d+\tTYPE_[A-Z_]+\t", re.M)  # A line of an Android trace: time [ms], sensor, values
 BETWEEN = 0.2  # Share of the rows below which rows with places are marks, and others lie between them
 
 
@@ -72,8 +70,8 @@ def table_of_log(path: Path, waypoints: Path | None = None) -> Table:
         raise InputError(f"{waypoints}: no marks; a row is t,x,y, or t and a note such as 1.5,2")
     if marks:
         return walked(field, marks, _accelerations(parts))
-    if field.find("x", "y") or field.find("lon", "lat"):
-        return field
+    if labels := field.find("x", "y") or field.find("lon", "lat"):
+        return _filled(field, [*labels, *field.find("heading")])
     for other in (part for key, part in parts.items() if key != name):
         if (labels := other.find("x", "y") or other.find("lon", "lat")) and other.find("t"):
             return _joined(field, other, labels)
@@ -205,6 +203,26 @@ def _joined(field: Table, other: Table, labels: list[str]) -> Table:
         columns.append(Column(label, values, field.path, None))
     note = f"{' and '.join(labels)} of {other.path.name}, by time"
     return Table((*field.columns, *columns), (*field.notes, note), field.comments)
+
+
+def _filled(table: Table, labels: list[str]) -> Table:
+    """A table whose rows hold a field or a place and never both, with the places between in time."""
+    names = table.find("field") or table.find("bx", "by", "bz")
+    if not names or not table.find("t"):
+        return table
+    read = np.isfinite(np.column_stack([table.numbers(name) for name in names])).all(axis=1)
+    placed = np.isfinite(np.column_stack([table.numbers(name) for name in labels])).all(axis=1)
+    if (read & placed).any() or not placed.any():
+        return table
+    t, _ = since_1970(table, table.find("t")[0])
+    cells = {}
+    for name in labels:
+        values = table.numbers(name)[placed]
+        values = np.unwrap(values) if name not in labels[:2] and "deg" not in name.lower() else values
+        cells[name] = np.interp(t, t[placed], values, np.nan, np.nan)
+    columns = (replace(c, cells=cells[c.name]) if c.name in cells else c for c in table.columns)
+    note = f"{', '.join(labels)} between the rows that have them, by time"
+    return Table(tuple(columns), (*table.notes, note), table.comments)
 
 
 def table_of(path: Path, columns: Mapping[str, Array]) -> Table:

@@ -28,8 +28,7 @@ from magtwin.tables.table import PARQUET, read_table
 
 Source = str | os.PathLike[str]
 
-POSE, MAGNITUDE = "/robot/enu/pose", "/robot/qtfm/magnitude"
-"""Names of the topics of poses and magnitudes in `magtwin.io.bags.topics`."""
+POSE, MAGNITUDE = "/robot/enu/pose", "/robot/qtfm/magnitude"  # In `magtwin.io.bags.topics`
 
 
 def read_readings(

@@ -50,6 +50,9 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
             b, rounding = _within_steps(vector, b, taken)
         vector = None
     t = _times(table, columns, told, taken)
+    if (zero := int(np.count_nonzero(b == 0))) and 2 * zero < len(b):
+        taken.append(f"{zero} readings of 0 left out, as a sensor without a reading writes")
+        b = np.where(b == 0, np.nan, b)
     some = [p, b[:, None]] + [v.reshape(len(p), -1) for v in (turn, vector, t) if v is not None]
     known: NDArray[np.bool_] = np.all(np.isfinite(np.hstack(some)), axis=1)
     if not known.any():
