@@ -42,10 +42,7 @@ class Sender:
     map_frame: str = "map"
     odom_frame: str = "odom"
     base_frame: str = "base_link"
-    truth_frame: str = (
-        "ground_truth"  # True pose of base_link in the map; on /tf if that is not odom's parent
-    )
-
+    truth_frame: str = "ground_truth"  # True pose of base_link in map; on /tf if that is not odom's parent
     imu_frame: str = "imu_link"
     magnetometer_frame: str = "magnetometer_link"
     lidar_frame: str = "rplidar_link"
