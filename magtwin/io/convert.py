@@ -23,22 +23,12 @@ def convert_run(
     force: bool = False,
     **reading: Any,
 ) -> Run:
-    """Convert a run to the format of the output's name.
+    """Convert a run, or the parts of one that did not end, to the format of the output's name.
 
-    Args:
-        source: A run in any format; also the parts of one that did not end.
-        out: File to make; a name without a suffix is the folder of a rosbag2.
-        scene: Stage for formats that show it. None: the one of the metadata.
-        out_unit: Unit of the field in a bag. None: T.
-        usd_fps: Frames per second in USD; 0 for one per reading. None: 30.
-        force: Whether an existing output is replaced.
-        reading: Options of `magtwin.io.formats.read_run`: topics, unit and scale of a robot's bag.
-
-    Returns:
-        The run.
-
-    Raises:
-        InputError: The source cannot be read, an option does not fit the formats, or the output exists.
+    A name without a suffix is the folder of a rosbag2. The `scene` is the stage for formats that show it, by
+    default that of the metadata; `out_unit` the unit of the field in a bag, by default T; `usd_fps` frames
+    per second in USD, by default 30, and 0 for one per reading; `reading` options of
+    `magtwin.io.formats.read_run`. An option that does not fit the formats is refused.
     """
     source, out = existing(source, "run"), Path(out)
     if out.resolve() == source.resolve():
@@ -66,14 +56,9 @@ def twin_to_show(
 ) -> Twin | None:
     """The scene to show a run in. Warns, and returns None, if the run's own scene cannot be opened.
 
-    Args:
-        run: The run.
-        file: File of the run; its folder is searched for the scene.
-        scene: Scene to use in place of the one of the metadata. `file`: the scene that the run plays over.
-        lacks: What the warning says is missing.
-
-    Raises:
-        InputError: Another `scene` was given and cannot be opened.
+    The folder of its `file` is searched for the scene. `scene` is used in place of that of the metadata, and
+    must open unless it is `file`, as for a run that plays over a scene. The warning says what is lacking in
+    `lacks`.
     """
     try:
         stage = scene_of(run, scene, near=file)

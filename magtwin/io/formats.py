@@ -90,8 +90,7 @@ USD = Format(
     takes=frozenset(("scene_file", "fps")),
 )
 
-BAGS = (".mcap", ".db3", ".bag")
-"""Suffixes of storage files of bags."""
+BAGS = (".mcap", ".db3", ".bag")  # Suffixes of storage files of bags
 
 _SUFFIXES = {".parquet": "PARQUET", ".csv": "CSV", ".npz": "NPZ", ".rrd": "RERUN", ".json": "RELEASE"}
 _SUFFIXES |= {".mcap": "BAG", ".db3": "DB3", ".bag": "ROS1", ".usd": "USD", ".usda": "USD", ".usdc": "USD"}
@@ -107,11 +106,7 @@ _TOLD: ContextVar[tuple[dict[str, Any], list[Path]] | None] = ContextVar("told",
 
 @contextmanager
 def recordings(**options: Any) -> Iterator[None]:
-    """Options for all robots' bags that `read_run` reads inside: `topics`, `unit` and `scale`.
-
-    Raises:
-        InputError: None was read.
-    """
+    """Options (`topics`, `unit`, `scale`) of all robots' bags that are read inside; one must be."""
     used = list[Path]()
     token = _TOLD.set((options, used))
     try:
@@ -191,11 +186,7 @@ def write_run(
 
 
 def format_of(path: Path) -> Format:
-    """The format of a file by its suffix, in any case; a bag if it has none.
-
-    Raises:
-        InputError: The suffix is unknown.
-    """
+    """The format of a file by its suffix, in any case; a bag if it has none."""
     if not path.suffix:
         return BAG
     suffix = path.suffix if path.suffix in FORMATS else path.suffix.lower()
@@ -210,11 +201,7 @@ def format_of(path: Path) -> Format:
 
 
 def format_to_write(path: Path) -> Format:
-    """The format of a file to write, by its suffix; a bag if it has none.
-
-    Raises:
-        InputError: The suffix is unknown, or its format is only read.
-    """
+    """The format of a file to write, by its suffix; a bag if it has none. It can be written."""
     written = [suffix for suffix, other in FORMATS.items() if other.write]
     if path.suffix and not {path.suffix, path.suffix.lower()} & {*FORMATS, ".usdz"}:
         raise InputError(f"{path}: unknown format of a run; {hint(path.suffix, written)}")
@@ -233,11 +220,7 @@ def _function(function: Function | str) -> Function:
 
 
 def runs_in(path: Path) -> list[Path]:
-    """The runs of a folder, in any format; [path] if it is a file, a bag or a folder of one run.
-
-    Raises:
-        InputError: It has the runs.csv of `magtwin sweep` alone.
-    """
+    """The runs of a folder, in any format; [path] if it is a file, a bag or a folder of one run."""
     if not os.path.isdir(path):  # noqa: PTH112 - False of a name that is too long
         return [path]
     if kind_of(path) is SWEEP:

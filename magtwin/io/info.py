@@ -20,15 +20,9 @@ NETWORKS = (".safetensors", ".pth", ".onnx")
 
 
 def info_of(path: str | os.PathLike[str], **reading: Any) -> Report:
-    """A report on the content and origin of a file.
+    """A report on the content and origin of a file: a run, stage, map, survey, table, log or network.
 
-    Args:
-        path: A run in any format of `magtwin.io.formats`, a stage or a map, a folder of survey CSVs, a table
-            or log with a field, or a network.
-        reading: Options of `magtwin.io.formats.read_run`, for a run.
-
-    Raises:
-        InputError: The file is missing, of an unknown kind, or damaged.
+    `reading` are options of `magtwin.io.formats.read_run`, for a run.
     """
     file = existing(shipped_or(Path(path)), "file")
     if is_bag(file):

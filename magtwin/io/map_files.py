@@ -12,14 +12,7 @@ Source = str | os.PathLike[str]
 
 
 def open_map(file: Source) -> AnomalyMap:
-    """The map of a layer or stage, or of a folder of survey CSVs.
-
-    Args:
-        file: As for `map_file`.
-
-    Raises:
-        InputError: There is no map, or it is damaged.
-    """
+    """The map of a layer or stage, or of a folder of survey CSVs, as from `map_file`."""
     from magtwin.field.survey.nodes import read_survey
     from magtwin.usd.maps.layer import load_map
 
@@ -30,11 +23,7 @@ def open_map(file: Source) -> AnomalyMap:
 
 
 def map_file(source: Source) -> Path:
-    """The file of a map: a layer, a stage, a folder of CSVs or of a scene, or the stage of a shipped scene.
-
-    Raises:
-        InputError: There is no such file or scene.
-    """
+    """The file of a map: a layer or stage, a folder of CSVs or of a scene, or that of a shipped scene."""
     path = Path(source)
     if os.path.exists(path):  # noqa: PTH110 - False of a name that is too long, which is refused below
         return shipped_or(path)

@@ -27,13 +27,11 @@ from magtwin.twin import Session, Twin, in_session, open_twin, room_of, scan, si
 if TYPE_CHECKING:
     from magtwin.sim.sensors.lidar import Scans
 
-IN_FOLDER = ("run.rrd", "run.parquet")
-"""Runs in a folder that is named as an output; the LiDAR's scans and a picture lie beside them."""
+IN_FOLDER = ("run.rrd", "run.parquet")  # Runs in a folder; scans and a picture lie beside them
 
 USD = (".usd", ".usda", ".usdc")
 
-OPENING = ("lab", "map_layer", "network", "magnetometer", "model_error", "tracking_error")
-"""Options of `magtwin.open_twin`."""
+OPENING = ("lab", "map_layer", "network", "magnetometer", "model_error", "tracking_error")  # Of `open_twin`
 
 
 @dataclass(frozen=True)
@@ -47,12 +45,9 @@ class Driven:
 
 
 def driven_by(path: str) -> "str | Commands | Run":
-    """What a text tells a robot to drive: the name of a path, or a file of x,y, as it is; commands; or a run.
+    """What to drive: the name of a path, or a file of x,y, as it is; commands; or a run.
 
     A file with a header t,v,w holds commands, as does one that is no path and can be read as commands.
-
-    Raises:
-        InputError: The file is none of these.
     """
     if path in (*PATHS, *CASES, "random") or not os.path.lexists(path):
         return path
@@ -87,21 +82,11 @@ def drive(
 ) -> Driven:
     """Drive a scene's robot along a path, by commands, or as in a recorded run.
 
-    Args:
-        scene_file: The stage.
-        path: What to drive, as from `driven_by`.
-        seed: Seed of all noise.
-        session: As for `magtwin.simulate`.
-        plant: As for `magtwin.simulate`.
-        fit: Whether the path is moved and shrunk until it fits.
-        scans: Whether the LiDAR's rays are cast.
-        metadata: Metadata of the run, such as names of files that move with it.
-        report: Called with a line about each step.
-        tell: Called with a line about what is driven otherwise than it was asked for.
-        options: Of `magtwin.open_twin` and `magtwin.simulate`.
-
-    Raises:
-        InputError: As for `magtwin.simulate`, or a file cannot be read.
+    `path` is as from `driven_by`, with `fit` moved and shrunk until it fits; seed, session and plant are as
+    for `magtwin.simulate`. With `scans` the LiDAR's rays are cast. `metadata` are added to the run's, such as
+    names of files that move with it; `report` is called with a line about each step, and `tell` with one
+    about what is driven otherwise than it was asked for. `options` are those of `magtwin.open_twin` and
+    `magtwin.simulate`.
     """
     drive_input(path)  # refuses a wrong name before the scene is opened
     twin = open_twin(scene_file, **{name: options.pop(name) for name in OPENING if name in options})
@@ -142,15 +127,11 @@ class Outputs:
 
     folder: Path | None
     files: tuple[Path, ...] = ()
-    scans: tuple[Path, ...] = ()
-    """Tables of the LiDAR's scans, beside Parquet files."""
+    scans: tuple[Path, ...] = ()  # Tables of the LiDAR's scans, beside Parquet files
     force: bool = False
-    out_unit: Literal["T", "nT"] | None = None
-    """Unit of the field in bags. None: T."""
-    usd_fps: float | None = None
-    """Frames per second in USD, 0 for one per reading. None: 30."""
-    robot: str = ""
-    """Robot whose name becomes part of the file names, in a scene of several."""
+    out_unit: Literal["T", "nT"] | None = None  # Unit of the field in bags. None: T.
+    usd_fps: float | None = None  # Frames per second in USD, 0 for one per reading. None: 30.
+    robot: str = ""  # Robot whose name becomes part of the file names, in a scene of several
     picture: Callable[[Driven, Path, bool], None] | None = None
     """Draws run.png in the folder: called with the run, the file and `force`."""
 
@@ -177,11 +158,7 @@ class Outputs:
         return made
 
     def free(self, robots: Iterable[str] = ()) -> "Outputs":
-        """The outputs by names that nothing has yet; see `magtwin.files.outputs.free`.
-
-        Args:
-            robots: Names of the robots, where several are written, each to files of its own.
-        """
+        """The outputs by names that nothing has yet, also for each of several robots by their names."""
         named, kinds = [*([self.folder] if self.folder else []), *self.files], {f.suffix for f in self.files}
         scans = [".scans.parquet"] if self.scans else []
         ends = [*scans, f"{named[0].suffix}.parts"]

@@ -41,8 +41,7 @@ CAUSES: Mapping[str, str] = {
 """Metadata that determine a run's columns, and the cause if they differ, likeliest first."""
 
 
-_MORE = 10
-"""How many times its readings a run may have by its rate and its length."""
+_MORE = 10  # How many times its readings a run may have by its rate and its length
 
 
 @dataclass(frozen=True)
@@ -50,12 +49,9 @@ class Difference:
     """Difference of a column between a run and its reproduction."""
 
     column: str
-    rows: int
-    """Number of rows that differ."""
-    first: int
-    """The first of them."""
-    greatest: float
-    """Largest absolute difference in the column's unit; nan if only one of the values is known."""
+    rows: int  # Number of rows that differ
+    first: int  # The first of them
+    greatest: float  # Largest absolute difference; nan if only one of the values is known
 
 
 @dataclass(frozen=True)
@@ -64,10 +60,8 @@ class Repeat:
 
     original: Run
     again: Run
-    causes: tuple[str, ...]
-    """Differing metadata that determine the columns, with old and new value."""
-    differences: tuple[Difference, ...]
-    """Columns that are not bit-identical."""
+    causes: tuple[str, ...]  # Differing metadata that determine the columns, with old and new value
+    differences: tuple[Difference, ...]  # Columns that are not bit-identical
 
     @property
     def equal(self) -> bool:
@@ -90,11 +84,7 @@ class Repeat:
 
 
 def repeat_of(file: str | FilePath, scene: str | FilePath | None = None) -> Repeat:
-    """Reproduce the run of a file, and compare it at the precision of the file's format.
-
-    Raises:
-        InputError: The file holds no run; or as for `repeat`.
-    """
+    """Reproduce the run of a file as `repeat`, and compare it at the precision of the file's format."""
     file = FilePath(file)
     run = read_run(file)
     result = repeat(run, scene, near=file)
@@ -186,16 +176,7 @@ def made_again(
 def map_of(
     run: Run, scene: str | FilePath | None = None, *, near: str | FilePath | None = None
 ) -> AnomalyMap:
-    """The map of a run, if its scene is available and the map is unchanged.
-
-    Args:
-        run: The run.
-        scene: As for `repeat`.
-        near: As for `repeat`.
-
-    Raises:
-        InputError: The scene is missing, or its map changed.
-    """
+    """The map of a run, if its scene is there and the map unchanged; arguments are those of `repeat`."""
     from magtwin.usd.layers import layer_sha256
     from magtwin.usd.maps.layer import load_map
     from magtwin.usd.scene import read_scene

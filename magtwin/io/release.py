@@ -33,11 +33,8 @@ from magtwin.files.file import read_text, sha256
 from magtwin.frames import canonical, quat_from_yaw, wrap_angle
 from magtwin.run.run import COLUMNS, Run
 
-_BETWEEN = re.compile(r"[\s,]*")
-"""Characters between frames."""
-
-_STUMP = re.compile(r"[A-Za-z-]{0,9}\s*")
-"""An incomplete word or sign at the end of half a frame."""
+_BETWEEN = re.compile(r"[\s,]*")  # Characters between frames
+_STUMP = re.compile(r"[A-Za-z-]{0,9}\s*")  # An incomplete word or sign at the end of half a frame
 
 _SIZES = {
     "timestamp": 1,
@@ -51,29 +48,17 @@ _SIZES = {
 }
 """Numbers of each entry of a frame; they may be in several lists."""
 
-_WIDTH = sum(_SIZES.values())
-"""Numbers in a frame."""
+_WIDTH = sum(_SIZES.values())  # Numbers in a frame
 
 
 def read_release(path: str | os.PathLike[str]) -> Run:
     """Read a recording of the released node's `save_json`.
 
     Each frame with a reading is a row; its other values are the latest ones before it. t is the wall clock
-    since the first reading, whose time is `start_s` in the metadata. Values that are not known yet, which
-    the node leaves out or writes as empty lists, are nan. Of two readings at the same time the later one
-    counts.
-
-    Args:
-        path: The file.
-
-    Returns:
-        A Run with b_measured_nt, b_map_nt, mocap_p, mocap_q_xyzw (z is 0: it is not recorded), p_world_base,
-        q_world_base_xyzw, yaw, odom_v, odom_w, imu_q_xyzw, imu_w, imu_a, battery_v, battery_fraction,
-        lidar_on. The metadata hold the number of frames and how the file ended.
-
-    Raises:
-        InputError: The file is missing or not such a list, a frame is not as above (the text gives its number
-            and position), its clock goes back, or no frame has a reading.
+    since the first reading, whose time is `start_s` in the metadata. Values that are not known yet, which the
+    node leaves out or writes as empty lists, are nan; z of poses is 0, as it is not recorded. Of two readings
+    at the same time the later one counts. The metadata hold the number of frames and how the file ended.
+    Errors give the number and position of a frame that is not as above.
     """
     path = Path(path)
     text, at, table, last = *_opened(path), array("d"), -math.inf

@@ -27,14 +27,6 @@ def write_scans(scans: Scans, path: str | os.PathLike[str], *, force: bool = Fal
 
     Columns t and arrival [s], p_world_lidar [m], q_world_lidar_xyzw, and ranges_m [m], a list of a fixed
     length; unit and meaning are on each Arrow field.
-
-    Args:
-        scans: The scans.
-        path: The file to make.
-        force: Replace an existing file.
-
-    Raises:
-        InputError: The file exists and `force` is not set.
     """
     columns, fields = [], []
     for name, (unit, doc) in _DOCS.items():

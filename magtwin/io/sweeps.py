@@ -30,8 +30,7 @@ LISTING = "runs.csv"
 LISTED = ("path", "seed", "session", "speed_m_s")
 ABOUT = "sweep.json"
 
-BLOCKS, BLOCK = 32, 16
-"""Processes get blocks of runs: at least so many blocks, of at most so many runs."""
+BLOCKS, BLOCK = 32, 16  # Processes get blocks of runs: at least so many blocks, of at most so many runs
 
 Progress = Callable[[int, int], Any]
 
@@ -40,13 +39,9 @@ Progress = Callable[[int, int], Any]
 class Listed:
     """What is said of some runs."""
 
-    rows: list[list[Any]] = field(default_factory=list)
-    """Rows of runs.csv."""
-
+    rows: list[list[Any]] = field(default_factory=list)  # Rows of runs.csv
     paths: dict[str, None] = field(default_factory=dict)
-    sessions: dict[str, str] = field(default_factory=dict)
-    """Session by session and its seed."""
-
+    sessions: dict[str, str] = field(default_factory=dict)  # Session by session and its seed
     driven_s: float = 0.0
     tally: Tally = field(default_factory=Tally)
 
@@ -227,13 +222,10 @@ class _Parts:
             raise
         took_s = max(time.monotonic() - start, 1e-9)
         said = Listed()
-        whole = True
-        for k in range(len(self.blocks)):
-            if self._part(k).exists():
-                said.extend(Listed.from_json(read_bytes(self._part(k), "part of a sweep", "JSON")))
-            else:
-                whole = False
-        if whole and self._finish(said):
+        parts = [part for part in map(self._part, range(len(self.blocks))) if part.exists()]
+        for part in parts:
+            said.extend(Listed.from_json(read_bytes(part, "part of a sweep", "JSON")))
+        if len(parts) == len(self.blocks) and self._finish(said):
             return said.report(f"{len(self.runs)} runs in {self.out}", took_s, made)
         title = f"{len(said.rows)} of {len(self.runs)} runs in {self.folder}; other shards make the rest"
         return said.report(title, took_s, made)

@@ -25,8 +25,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, RepairWarning, find
-from magtwin.files.budget import BUDGETS, check_count, check_decoded, check_size, decoded_limit
-from magtwin.files.file import check_zip, existing
+from magtwin.files.budget import BUDGETS, check_count, check_decoded, decoded_limit
+from magtwin.files.file import check_zip, existing, existing_file
 from magtwin.files.outputs import check_free, output
 from magtwin.run import mapped
 from magtwin.run.arrow import (
@@ -44,34 +44,21 @@ from magtwin.tables.parquet import load_parquet
 from magtwin.tables.quantities import QUANTITIES
 from magtwin.tables.table import Column, Table
 
-_ABOUT = "magtwin"
-"""Name of the member of an npz with the metadata, and first word of a CSV."""
+_ABOUT = "magtwin"  # Name of the member of an npz with the metadata, and first word of a CSV
 
 _OWN = {("t",): ("t",), ("x", "y"): ("p_world_base_x", "p_world_base_y"), ("heading",): ("yaw",)}
 """Columns of a Run that are known by the quantity that a table of another program names."""
 
-NUMBER = 8
-"""Bytes of a number in memory."""
+_BROKEN = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, RuntimeError, ValueError)
+"""What zipfile and numpy raise for a damaged npz."""
 
-_CSV_ABOUT = 100_000
-"""Most lines of a CSV that begin with #; a run has one for each column, and three others."""
-
-_CSV_LINE = 1 << 20
-"""Longest line of a CSV [bytes]; a header of ten thousand columns is shorter."""
+NUMBER = 8  # Bytes of a number in memory
+_CSV_ABOUT = 100_000  # Most lines of a CSV that begin with #; a run has one for each column, and three others
+_CSV_LINE = 1 << 20  # Longest line of a CSV [bytes]; a header of ten thousand columns is shorter
 
 
 def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool = False) -> None:
-    """Write a run as Parquet; the same run gives the same bytes.
-
-    Args:
-        run: The run; its clock `t` must ascend.
-        path: The file to make.
-        force: Replace an existing file.
-
-    Raises:
-        InputError: The file exists and `force` is not set, or cannot be written, or a column cannot stand
-            in a table.
-    """
+    """Write a run, whose clock `t` must ascend, as Parquet; the same run gives the same bytes."""
     check_clock(run, "the run to write")
     tables = map(table_of, blocks(run))
     first = next(tables)
@@ -100,16 +87,10 @@ def _write_tables(first: pa.Table, others: Iterable[pa.Table], where: Any) -> No
 
 
 def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None = None) -> Run:
-    """Read a run that `write_parquet` wrote, to the last bit, or a folder of parts.
+    """Read a run that `write_parquet` wrote, to the last bit, or the folder of an unfinished `ParquetParts`.
 
-    A file of another program is read too if it has the column names of a Run.
-
-    Args:
-        path: The file, or the folder that an unfinished `ParquetParts` left.
-        columns: Other names of columns, as for `read_csv`.
-
-    Raises:
-        InputError: The file is missing, is not Parquet, was cut short, lacks a column, or holds no run.
+    A file of another program is read too if it has the column names of a Run; `columns` are other names, as
+    for `read_csv`.
     """
     path = existing(path, "Parquet file")
     try:
@@ -164,11 +145,6 @@ def _read_long(path: Path, files: Sequence[Path], columns: Mapping[str, str] | N
     return run
 
 
-def _check_file(path: Path, kind: str) -> None:
-    if path.is_dir():
-        raise InputError(f"{path}: a folder, not {kind}; name the file in it")
-
-
 class ParquetParts:
     """A run that grows: each block becomes a Parquet file in the folder `F.parts`.
 
@@ -176,18 +152,9 @@ class ParquetParts:
     """
 
     def __init__(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """Start a file.
-
-        Args:
-            path: The file F.
-            force: Replace an existing file, and the parts of an unfinished one.
-
-        Raises:
-            InputError: It exists and `force` is not set, or its folder cannot be written.
-        """
+        """Start a file; `force` replaces it, and the parts of an unfinished one."""
         self.path = check_free(path, force=force)
-        self.folder = Path(f"{self.path}.parts")
-        """Folder of the parts."""
+        self.folder = Path(f"{self.path}.parts")  # Folder of the parts
         if self.folder.exists() and not force:
             raise InputError(
                 f"{self.folder}: parts of a run that did not end; magtwin convert reads them; give --force "
@@ -201,11 +168,7 @@ class ParquetParts:
             raise InputError(f"{self.folder}: cannot be written ({error.strerror})") from error
 
     def append(self, run: Run) -> None:
-        """Add the rows of a block, and write them to the disk.
-
-        Raises:
-            InputError: It does not begin after the previous block, or the disk is full.
-        """
+        """Add the rows of a block, which begins after the previous one, and write them to the disk."""
         if not run.rows:
             return
         check_clock(run, "the block to append")
@@ -222,11 +185,9 @@ class ParquetParts:
 def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) -> None:
     """Write a run as CSV: metadata in lines that begin with #, a line of names, one line per row.
 
-    Numbers have the fewest digits that give the same bits back; flags are true and false. pandas reads
-    it with `read_csv(F, comment="#")` (before pandas 3, with `float_precision="round_trip"` beside), DuckDB
-    with `read_csv('F', comment='#')`, polars with `read_csv(F, comment_prefix="#")`.
-
-    Arguments and errors are those of `write_parquet`.
+    Numbers have the fewest digits that give the same bits back; flags are true and false. pandas reads it
+    with `read_csv(F, comment="#")` (before pandas 3, with `float_precision="round_trip"` beside), DuckDB with
+    `read_csv('F', comment='#')`, polars with `read_csv(F, comment_prefix="#")`.
     """
     check_clock(run, "the run to write")
     table = table_of(run.take(slice(0, 1)))
@@ -253,20 +214,11 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
     """Read a run that `write_csv` wrote, to the last bit.
 
     A file of another program is read too if its columns have the names of a Run; vectors are split as in
-    `odom_p_x`.
-
-    Args:
-        path: The file.
-        columns: Names in the file by names of a Run, such as `{"odom_p_x": "x"}`. A p_world_base without z
-            lies on the floor.
-
-    Raises:
-        InputError: The file is missing, is not a CSV of numbers, is truncated, lacks a column, or holds no
-            run.
+    `odom_p_x`. `columns` are names in the file by names of a Run, such as `{"odom_p_x": "x"}`. A p_world_base
+    without z lies on the floor.
     """
-    path = existing(path, "CSV file")
-    _check_file(path, "a CSV file")
-    size = check_size(path, "CSV")
+    path = existing_file(path, "CSV file", "CSV")
+    size = path.stat().st_size
     with open(path, "rb") as file:
         about, names, skipped = _csv_head(file, path)
         file.seek(-1, os.SEEK_END)
@@ -416,8 +368,6 @@ def write_npz(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
     """Write a run as npz: one array per column, and `magtwin`, a JSON text with metadata, units and frames.
 
     Arrays are not compressed, for speed, and nothing is pickled. The same run gives the same bytes.
-
-    Arguments and errors are those of `write_parquet`.
     """
     check_clock(run, "the run to write")
     run.take(slice(0, 1)).members()  # refuses other than numbers
@@ -450,18 +400,8 @@ def _write_array(member: Any, values: NDArray[Any]) -> None:
 
 
 def read_npz(path: str | os.PathLike[str]) -> Run:
-    """Read a run that `write_npz` wrote, to the last bit, or any npz with array names of a Run.
-
-    Args:
-        path: The file.
-
-    Raises:
-        InputError: The file is missing, is not npz, is damaged or truncated, holds pickled objects, which are
-            never read, or holds no run.
-    """
-    path = existing(path, "npz file")
-    _check_file(path, "an npz file")
-    check_size(path, "npz")
+    """Read a run that `write_npz` wrote, to the last bit, or any npz with array names of a Run."""
+    path = existing_file(path, "npz file", "npz")
     try:
         with zipfile.ZipFile(path) as archive:
             check_zip(path, archive, "npz", "arrays")
@@ -469,15 +409,7 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
             if twice := sorted(name for name, count in names.items() if count > 1):
                 raise InputError(f"{path}: two arrays are called {twice[0]!r}; write it again")
             arrays = {name.removesuffix(".npy"): _array(archive, name, path) for name in names}
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        struct.error,
-        EOFError,
-        OSError,
-        RuntimeError,
-        ValueError,
-    ) as error:
+    except _BROKEN as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: not an npz file, damaged, or cut short ({error})") from error

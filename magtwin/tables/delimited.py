@@ -16,48 +16,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from magtwin.errors import InputError
-from magtwin.files.budget import check_size
-from magtwin.files.file import existing
+from magtwin.files.file import existing_file
 from magtwin.tables.labels import meaning_of, split_label
 from magtwin.tables.quantities import UNITS
 
-LONGEST_LINE = 65_536
-"""Longest line [characters]."""
+LONGEST_LINE = 65_536  # Longest line [characters]
+QUOTED = 60  # Most characters of a file that an error message quotes
+HEAD = 4096  # Bytes from which the encoding is found
+LOOKED = 50  # Lines from which the separator is found
+MOST_ABOVE = 20  # Most lines above the header, such as the name and the date of a recording
+LEAST_ROWS = 8  # Rows from which a last number can be told to be cut short
+LOST = 5.0  # Factor below all others from which a number is cut short; a lost digit makes it a tenth
 
-QUOTED = 60
-"""Most characters of a file that an error message quotes."""
-
-HEAD = 4096
-"""Bytes from which the encoding is found."""
-
-LOOKED = 50
-"""Lines from which the separator is found."""
-
-MOST_ABOVE = 20
-"""Most lines above the header, such as the name and the date of a recording."""
-
-LEAST_ROWS = 8
-"""Rows from which a last number can be told to be cut short."""
-
-LOST = 5.0
-"""Factor below all others from which a number is cut short; a lost digit makes it a tenth."""
-
-MISSING = {
-    "\N{EM DASH}",
-    "\N{EN DASH}",
-    "",
-    "nan",
-    "na",
-    "n/a",
-    "null",
-    "none",
-    "-",
-    "--",
-    "*",
-    "#na",
-    "#nv",
-    "#n/a",
-}
+MISSING = {"", "nan", "na", "n/a", "null", "none", "-", "--", "*", "#na", "#nv", "#n/a"}
+MISSING |= {"\N{EM DASH}", "\N{EN DASH}"}
 """Words for a missing value, in lower case; `*` is that of Geosoft. Spreadsheets also write errors for them,
 such as #DIV/0!."""
 
@@ -87,32 +59,22 @@ _SUMMARY = re.compile(
 
 _BELOW_1000 = re.compile(r"\s*[+-]?\d{1,3}([.,]\d*)?\s*", re.ASCII)
 
-_BEGUN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d*)?([eE][+-]?)?", re.ASCII)
-"""The begin of a number."""
+_BEGUN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d*)?([eE][+-]?)?", re.ASCII)  # The begin of a number
 
 _SLASH = re.compile(r"\s*/([^\w,;]|\w+\s|$)")
 """A comment line of Geosoft's XYZ, and no word that begins with a slash, such as a topic of ROS."""
 
-_TRACK = re.compile(r"\s*(line|tie)\s+(?=\S*\d)\S+\s*", re.IGNORECASE)
-"""A line of Geosoft's XYZ that begins a survey line."""
-
-_REMARK = re.compile(r"\s*#\s*\w+:\s")
-"""A comment line `# KEY: VALUE`, as in maps written as CSV."""
+_TRACK = re.compile(r"\s*(line|tie)\s+(?=\S*\d)\S+\s*", re.IGNORECASE)  # Begins a survey line of Geosoft
+_REMARK = re.compile(r"\s*#\s*\w+:\s")  # A comment line `# KEY: VALUE`, as in maps written as CSV
 
 _BRACKET = re.compile(r"[\[(]")
 _ERROR = re.compile(r"\s*#(n/?a|nv|value!|div/0!|ref!|num!|name\?|null!)\s*", re.IGNORECASE)
-_CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f]")
-"""Characters that no text has."""
-
-_Lines = list[tuple[int, str]]
-"""Number and text of lines."""
-
-_Rows = list[tuple[int, list[str]]]
-"""Line and words of rows."""
+_CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f]")  # Characters that no text has
+_Lines = list[tuple[int, str]]  # Number and text of lines
+_Rows = list[tuple[int, list[str]]]  # Line and words of rows
 
 
-_PLACED = ("x", "y", "heading")
-"""Quantities one of which a header names, if prose above it looks like another header."""
+_PLACED = ("x", "y", "heading")  # A header names one, if prose above it looks like another header
 
 _UNITS = frozenset(unit.replace("_", "") for unit in UNITS)
 
@@ -121,23 +83,12 @@ _UNITS = frozenset(unit.replace("_", "") for unit in UNITS)
 class Delimited:
     """Rows of words, all of one width."""
 
-    path: Path
-    """The file."""
-
-    names: tuple[str, ...]
-    """Names of the columns; () in a file without a header."""
-
-    rows: Sequence[Sequence[str]]
-    """Words of each row."""
-
-    lines: Sequence[int]
-    """Line of each row in the file."""
-
-    notes: tuple[str, ...] = ()
-    """What was repaired."""
-
-    comments: tuple[tuple[int, str], ...] = ()
-    """Number and text of the lines that begin with `#`."""
+    path: Path  # The file
+    names: tuple[str, ...]  # Names of the columns; () in a file without a header
+    rows: Sequence[Sequence[str]]  # Words of each row
+    lines: Sequence[int]  # Line of each row in the file
+    notes: tuple[str, ...] = ()  # What was repaired
+    comments: tuple[tuple[int, str], ...] = ()  # Number and text of the lines that begin with `#`
 
 
 def read_delimited(
@@ -145,31 +96,21 @@ def read_delimited(
 ) -> Delimited:
     """Read a text file of rows whose words are separated by commas, semicolons, tabs or blanks.
 
-    The text is UTF-8, UTF-16, or cp1252, which older spreadsheets write. The header is the
-    first line if any of its words is not a number, else the last comment line above the rows with as many
-    words as they have. These are skipped: other lines that begin with `#`, such as `# KEY: VALUE`; those that
-    begin with `/` if the first line does; empty lines; a first line `sep=;`; lines of prose above the header
-    and one below the rows; headers that are repeated; and the lines `Line 10` and `Tie 3` of Geosoft. The
-    units in a row below the header are added to the names, as in `x [cm]`. A decimal comma is read unless
-    commas separate the words or other numbers have decimal points. Marks between thousands are read if all
-    numbers of the column fit. If the last line has no end, it is left out if it has fewer words than others;
-    its last number is missing if it is far below all others of its column.
+    The text is UTF-8, UTF-16, or cp1252, which older spreadsheets write. The header is the first line if any
+    of its words is not a number, else the last comment line above the rows with as many words as they have.
+    These are skipped: other lines that begin with `#`, such as `# KEY: VALUE`; those that begin with `/` if
+    the first line does; empty lines; a first line `sep=;`; lines of prose above the header and one below the
+    rows; headers that are repeated; and the lines `Line 10` and `Tie 3` of Geosoft. The units in a row below
+    the header are added to the names, as in `x [cm]`. A decimal comma is read unless commas separate the
+    words or other numbers have decimal points. Marks between thousands are read if all numbers of the column
+    fit. If the last line has no end, it is left out if it has fewer words than others; its last number is
+    missing if it is far below all others of its column.
 
-    Args:
-        path: The file.
-        noun: What it is, for error messages.
-        wanted: What a row holds, for error messages ("one row of numbers per reading").
-        content: The bytes of the file, if it lies in an archive.
-
-    Raises:
-        InputError: The file is missing, not text, or empty, or its lines are too long or of different widths.
+    Errors tell its `noun` and what a row holds, which is `wanted` ("one row of numbers per reading").
+    `content` are the bytes of a file that lies in an archive.
     """
     if content is None:
-        path = existing(path, noun)
-        if path.is_dir():
-            raise InputError(f"{path}: cannot be read (a folder); expected a {noun}")
-        check_size(path, "readings")
-        content = path.read_bytes()
+        content = existing_file(path, noun, "readings").read_bytes()
     path, notes = Path(path), list[str]()
     lines, ended = _lines(path, _decoded(path, content, noun, notes))
     comments, above, lines, told = _without_comments(lines, notes)
@@ -181,7 +122,8 @@ def read_delimited(
     rows = _words(path, lines[prose:], between)
     first = _header(rows)
     if prose or first:
-        notes.append(f"line {rows[first][0]} as the header, and the lines above it as prose")
+        what = "header" if _is_header(rows[first][1]) else "first row"
+        notes.append(f"line {rows[first][0]} as the {what}, and the lines above it as prose")
     above = [comment for comment in above if comment[0] < rows[first][0]]
     names, rows = _names(path, rows[first:], above, between)
     if not rows:
@@ -286,7 +228,8 @@ def _names(path: Path, rows: _Rows, above: _Lines, between: str | None) -> tuple
     if _is_header(rows[0][1]):
         return [word.strip() for word in rows[0][1]], rows[1:]
     names: list[str] = []
-    for comment, mark in itertools.product(above, dict.fromkeys((between, *",;\t", None))):
+    marks = [*dict.fromkeys((between or ",", *",;\t", None))]  # the first that fits counts
+    for comment, mark in itertools.product(above, reversed(marks)):
         with suppress(InputError):  # prose with unpaired quotes
             ((_, header),) = _words(path, [comment], mark)
             names = [word.strip() for word in header] if len(header) == len(rows[0][1]) else names
@@ -386,10 +329,9 @@ def _lines(path: Path, text: str) -> tuple[_Lines, bool]:
 
 
 def _separator(lines: _Lines) -> tuple[str | None, int]:
-    """What stands between the words of lines, and the number of lines of prose above the header.
+    """What stands between the words of lines (None: blanks), and the number of lines of prose above.
 
-    It is the mark that each line has as often, from the header on; None for blanks. The last line of a short
-    file may differ.
+    It is the mark that each line has as often, from the header on; the last line of a short file may differ.
     """
     begun = [line for _, line in lines[:LOOKED]]
     found = _mark(begun) or (_mark(begun[:-1]) if 2 < len(lines) <= LOOKED else None)
@@ -401,7 +343,8 @@ def _blanks(lines: Sequence[str]) -> tuple[None, int] | None:
     words = [line.split() for line in lines]
     rows = [len(row) == len(words[-1]) > 1 and not any(map(_is_text, row)) for row in words]
     above = rows.index(True) if True in rows else len(rows)
-    return (None, above) if all(rows[above:]) and 0 < above < min(MOST_ABOVE, len(rows) - 1) else None
+    above -= 0 < above < len(rows) and len(words[above - 1]) == len(words[-1])  # a header
+    return (None, above) if all(rows[above + 1 :]) and 0 < above < min(MOST_ABOVE, len(rows) - 1) else None
 
 
 def _mark(lines: Sequence[str]) -> tuple[str | None, int] | None:
@@ -473,7 +416,7 @@ def _without_begun(number: int, rows: list[list[str]], notes: list[str]) -> None
 def _without_thousands(rows: list[list[str]]) -> list[int]:
     """Take the marks between thousands out of the columns all of whose numbers fit; returns these columns.
 
-    A comma may be a decimal one. It is between thousands if a number has a point after it, or two of them.
+    A comma is between thousands if a number has a point after it, or two of them; else it may be decimal.
     """
     found = {
         k: match["mark"]

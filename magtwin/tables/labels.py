@@ -15,37 +15,24 @@ _SIGNS = str.maketrans(
     }
 )
 _BRACKETS = re.compile(r"[\[\]()]")
-_LEFT_OUT = ("in", "per")
-"""Words between a name and its unit, and in a unit."""
-
-MOST_WORDS = 12
-"""Labels of more words name nothing."""
-
-LONGEST = 500
-"""Characters of a label that are read."""
+_LEFT_OUT = ("in", "per")  # Words between a name and its unit, and in a unit
+MOST_WORDS = 12  # Labels of more words name nothing
+LONGEST = 500  # Characters of a label that are read
 
 
 class Label(NamedTuple):
     """A header of a column."""
 
-    words: tuple[str, ...]
-    """Words in lower case."""
-
-    unit: str
-    """Unit in brackets at its end, in lower case; "" if there is none."""
+    words: tuple[str, ...]  # Words in lower case
+    unit: str  # Unit in brackets at its end, in lower case; "" if there is none
 
 
 class Meaning(NamedTuple):
     """How a label names a quantity; the least is the best."""
 
-    name: int
-    """Index of the name in those of the quantity."""
-
-    around: int
-    """Number of words around the name."""
-
-    unit: str
-    """Unit of the label, in lower case; "" if there is none."""
+    name: int  # Index of the name in those of the quantity
+    around: int  # Number of words around the name
+    unit: str  # Unit of the label, in lower case; "" if there is none
 
 
 def split_label(text: str) -> Label:

@@ -17,14 +17,9 @@ from magtwin.files.protobuf import varint
 
 _MAGIC = b"PAR1"
 
-_BATCH = 1 << 20
-"""Most rows of texts that are measured at once."""
-
-_TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
-"""Ticks per second of a timestamp of Arrow, by its unit."""
-
-_FIXED = "FIXED_LEN_BYTE_ARRAY"
-"""Texts of equal length, whose length is in the metadata."""
+_BATCH = 1 << 20  # Most rows of texts that are measured at once
+_TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}  # Ticks per second of a timestamp of Arrow, by its unit
+_FIXED = "FIXED_LEN_BYTE_ARRAY"  # Texts of equal length, whose length is in the metadata
 
 _ROW_GROUPS, _COLUMNS, _ABOUT = 4, 1, 3
 _COUNT, _PACKED, _DATA, _DICTIONARY = 5, 7, 9, 11
@@ -39,11 +34,7 @@ def _whole(path: Path) -> pa.Table:
 
 
 def load_parquet(path: Path, load: Callable[[Path], Any] = _whole) -> Any:
-    """A Parquet file, loaded by a function of pyarrow.
-
-    Raises:
-        InputError: It is no regular file, does not begin and end like Parquet, or is damaged.
-    """
+    """A Parquet file, loaded by a function of pyarrow, if it begins and ends like one and is whole."""
     path = existing(path, "Parquet file")
     if path.is_dir():
         raise InputError(f"{path}: a folder, not a Parquet file; name the file in it")
@@ -67,11 +58,7 @@ def load_parquet(path: Path, load: Callable[[Path], Any] = _whole) -> Any:
 
 
 def parquet_columns(path: Path) -> list[tuple[str, NDArray[Any]]]:
-    """Name and cells of the columns of numbers, texts and timestamps; timestamps are seconds since 1970.
-
-    Raises:
-        InputError: As for `load_parquet`; or there are no rows.
-    """
+    """Name and cells of the columns of numbers, texts and timestamps, which are seconds since 1970."""
     table = load_parquet(path)
     columns = []
     for field, values in zip(table.schema, table.columns, strict=True):
@@ -92,11 +79,7 @@ def parquet_columns(path: Path) -> list[tuple[str, NDArray[Any]]]:
 
 
 def check_parquet(path: Path) -> None:
-    """Refuse a Parquet file that would be too large in memory: equal values take no room in the file.
-
-    Raises:
-        InputError: Its columns, decoded, are over the budget, or there are too many of them.
-    """
+    """Refuse a Parquet file too large in memory: equal values take no room in the file."""
     size = check_size(path, "Parquet")
     with pq.ParquetFile(path) as file:
         about = file.metadata

@@ -46,8 +46,7 @@ FIELDS = {
 }
 """nT per unit of the magnetic field."""
 
-CLOCKWISE = (3,)
-"""Places among the names of a heading of those that count clockwise from north."""
+CLOCKWISE = (3,)  # Places among the names of a heading of those that count clockwise from north
 
 SPEEDS = {
     **dict.fromkeys(("m_s", "mps", "m_s_1"), 1.0),
@@ -71,146 +70,86 @@ IN_BRACKETS = frozenset({"t", "g", "min", "h"})
 class Quantity:
     """What a column may hold."""
 
-    names: tuple[str, ...]
+    names: str
     """Its names, the usual one first, in lower case with low lines between words, and `|` between equals.
     Those of one place belong together in quantities of one kind, as easting and northing."""
 
-    units: Mapping[str, float]
-    """Factors to SI units or nT, by unit in lower case."""
+    units: Mapping[str, float]  # Factors to SI units or nT, by unit in lower case
+    beside: str = ""  # Words before or behind a name that say where it comes from
 
-    around: frozenset[str] = frozenset()
-    """Words before or behind a name that say where it comes from."""
+    @cached_property
+    def around(self) -> frozenset[str]:
+        """The words of `beside`."""
+        return frozenset(self.beside.split())
 
     @cached_property
     def places(self) -> dict[str, int]:
         """Places in `names` by single name."""
-        return {one: k for k, names in reversed(list(enumerate(self.names))) for one in names.split("|")}
+        several = list(enumerate(self.names.split()))
+        return {one: k for k, names in reversed(several) for one in names.split("|")}
 
 
-_AT = frozenset(
-    (
-        *(
-            "p",
-            "t",
-            "pos",
-            "position",
-            "pose",
-            "point",
-            "coord",
-            "wp",
-            "map",
-            "world",
-            "base",
-            "robot",
-            "rs",
-            "r",
-        ),
-        *("utm", "local", "coordinate", "koordinate", "coordonnee", "coordenada", "coordinata", "proj"),
-    )
+_AT = (
+    "p t pos position pose point coord wp map world base robot rs r utm local coordinate koordinate "
+    "coordonnee coordenada coordinata proj"
 )
-_ON_EARTH = frozenset(("location", "gps", "gnss", "geo", "wgs84", "pos", "position", "decimal", "dd"))
-_READINGS = frozenset(
-    (
-        "strength",
-        "value",
-        "reading",
-        "raw",
-        "sensor",
-        "measured",
-        "calibrated",
-        "avg",
-        "mean",
-        "corrected",
-        "cor",
-    )
-)
-_SENT = frozenset(("twist", "cmd", "vel", "msg", "data", "header"))
+_ON_EARTH = "location gps gnss geo wgs84 pos position decimal dd"
+_READINGS = "strength value reading raw sensor measured calibrated avg mean corrected cor"
+_SENT = "twist cmd vel msg data header"
 _VECTORS = (
-    *("b{}", "b_{}", "m{}", "mag_{}", "mag{}", "field_{}", "magnetic_field_{}", "mag_field_{}"),
-    *("magnetometer_{}", "magnetfeld_{}", "feld_{}", "champ_{}", "campo_{}", "champ_magnetique_{}"),
-    *("campo_magnetico_{}", "flux_{}", "raw_mag_{}", "mag_raw_{}"),
+    "b{} b_{} m{} mag_{} mag{} field_{} magnetic_field_{} mag_field_{} magnetometer_{} magnetfeld_{} "
+    "feld_{} champ_{} campo_{} champ_magnetique_{} campo_magnetico_{} flux_{} raw_mag_{} mag_raw_{}"
 )
 
 QUANTITIES: dict[str, Quantity] = {
     "x": Quantity(
-        (
-            *("x", "easting|eastings", "east", "rechtswert", "e", "px", "posx", "xpos", "tx", "ostwert"),
-            *("est|ost", "este", "abscisse", "ascissa"),
-        ),
+        "x easting|eastings east rechtswert e px posx xpos tx ostwert est|ost este abscisse ascissa",
         LENGTHS,
         _AT,
     ),
     "y": Quantity(
-        (
-            *("y", "northing|northings", "north", "hochwert", "n", "py", "posy", "ypos", "ty", "nordwert"),
-            *("nord", "norte", "ordonnee", "ordinata"),
-        ),
+        "y northing|northings north hochwert n py posy ypos ty nordwert nord norte ordonnee ordinata",
         LENGTHS,
         _AT,
     ),
-    "lon": Quantity(
-        ("lon|lng|long|longitude|lange|laenge|langengrad|longitud|longitudine",), ANGLES, _ON_EARTH
-    ),
-    "lat": Quantity(("lat|latitude|breite|breitengrad|latitud|latitudine",), ANGLES, _ON_EARTH),
-    "heading": Quantity(
-        ("heading", "yaw", "theta", "azimuth|azimut|bearing|compass|rumbo|kurs"), ANGLES, _AT
-    ),
+    "lon": Quantity("lon|lng|long|longitude|lange|laenge|langengrad|longitud|longitudine", ANGLES, _ON_EARTH),
+    "lat": Quantity("lat|latitude|breite|breitengrad|latitud|latitudine", ANGLES, _ON_EARTH),
+    "heading": Quantity("heading yaw theta azimuth|azimut|bearing|compass|rumbo|kurs", ANGLES, _AT),
     "t": Quantity(
-        (
-            *("t", "time", "timestamp", "stamp", "seconds_elapsed", "elapsed", "time_since_start", "times"),
-            *("seconds", "elapsed_time", "zeit", "uhrzeit", "zeitstempel", "temps", "heure", "horodatage"),
-            *("tiempo", "hora", "tempo", "ora", "datetime", "date_time", "utc", "utc_time"),
-            *("gps_time", "epoch", "relative_time"),
-        ),
+        "t time timestamp stamp seconds_elapsed elapsed time_since_start times seconds elapsed_time "
+        "zeit uhrzeit zeitstempel temps heure horodatage tiempo hora tempo ora datetime date_time utc "
+        "utc_time gps_time epoch relative_time",
         TIMES,
         _SENT,
     ),
     "field": Quantity(
-        (
-            *("field", "b_nt", "scalar_mag", "magnitude", "b_measured", "b_total", "b_ut", "absolute_field"),
-            *("b", "b_tot", "btotal", "bt", "b_t", "b_mag", "b_abs", "bmag", "mag", "total", "total_field"),
-            *("mag_total", "magnetic_field", "mag_field", "tmi", "mag_tmi", "f", "feldstarke", "feldstaerke"),
-            *("gesamtfeld", "totalfeld", "magnetfeld", "totalintensitat", "flussdichte", "intensitat"),
-            *("champ", "champ_total", "champ_magnetique", "champ_magnetique_total", "intensite", "module"),
-            *("campo", "campo_total", "campo_magnetico", "campo_magnetico_total", "intensidad", "modulo"),
-            *(
-                "campo_totale",
-                "intensita",
-                "intensita_totale",
-                "intensidad_total",
-                "intensite_totale",
-                "nt",
-                "ut",
-            ),
-            *("total_intensity", "total_magnetic_intensity", "magnetic_intensity", "flux_density", "mag1"),
-            *("magnetic_flux_density", "total_magnetic_field", "raw_mag", "mag_raw", "mag_1", "mag_1_uc"),
-            *("absolute_magnetic_field", "intensity", "strength", "field_strength", "scalar"),
-            *("magnetic_rotation_sensor", "magnetometer"),
-        ),
+        "field b_nt scalar_mag magnitude b_measured b_total b_ut absolute_field b b_tot btotal bt b_t "
+        "b_mag b_abs bmag mag total total_field mag_total magnetic_field mag_field tmi mag_tmi f "
+        "feldstarke feldstaerke gesamtfeld totalfeld magnetfeld totalintensitat flussdichte intensitat "
+        "champ champ_total champ_magnetique champ_magnetique_total intensite module campo campo_total "
+        "campo_magnetico campo_magnetico_total intensidad modulo campo_totale intensita "
+        "intensita_totale intensidad_total intensite_totale nt ut total_intensity "
+        "total_magnetic_intensity magnetic_intensity flux_density mag1 magnetic_flux_density "
+        "total_magnetic_field raw_mag mag_raw mag_1 mag_1_uc absolute_magnetic_field intensity "
+        "strength field_strength scalar magnetic_rotation_sensor magnetometer",
         FIELDS,
         _READINGS,
     ),
-    **{f"b{axis}": Quantity(tuple(name.format(axis) for name in _VECTORS), FIELDS) for axis in "xyz"},
+    **{f"b{axis}": Quantity(_VECTORS.replace("{}", axis), FIELDS) for axis in "xyz"},
     "v": Quantity(
-        (
-            *("v", "v_cmd", "cmd_v", "vx", "v_x", "linear", "linear_x", "lin", "lin_x", "lin_vel", "v_lin"),
-            *("linear_velocity", "linear_velocity_x", "linear_speed", "speed", "velocity", "vel", "vel_x"),
-            *("velocity_x", "forward", "forward_speed", "forward_velocity"),
-        ),
+        "v v_cmd cmd_v vx v_x linear linear_x lin lin_x lin_vel v_lin linear_velocity "
+        "linear_velocity_x linear_speed speed velocity vel vel_x velocity_x forward forward_speed "
+        "forward_velocity",
         SPEEDS,
         _SENT,
     ),
     "w": Quantity(
-        (
-            *("w", "w_cmd", "cmd_w", "wz", "w_z", "omega", "omega_z", "angular", "angular_z", "ang", "ang_z"),
-            *("ang_vel", "w_ang", "angular_velocity", "angular_velocity_z", "angular_speed", "yaw_rate"),
-            *("yawrate", "yaw_speed", "turn_rate", "turn", "rotation_rate"),
-        ),
+        "w w_cmd cmd_w wz w_z omega omega_z angular angular_z ang ang_z ang_vel w_ang angular_velocity "
+        "angular_velocity_z angular_speed yaw_rate yawrate yaw_speed turn_rate turn rotation_rate",
         RATES,
         _SENT,
     ),
 }
 """Quantities by the symbol that programs use."""
 
-UNITS = frozenset(unit for quantity in QUANTITIES.values() for unit in quantity.units)
-"""All units."""
+UNITS = frozenset(unit for quantity in QUANTITIES.values() for unit in quantity.units)  # All units

@@ -11,11 +11,7 @@ from magtwin.tables.delimited import number_of
 
 
 def text_of_spreadsheet(path: Path) -> bytes:
-    """The first sheet that has rows of numbers, as CSV in UTF-8.
-
-    Raises:
-        InputError: The file is damaged or has no such sheet, or python-calamine is missing.
-    """
+    """The first sheet that has rows of numbers, as CSV in UTF-8."""
     check_size(path, "readings")
     try:
         from python_calamine import CalamineError, CalamineWorkbook

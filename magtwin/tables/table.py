@@ -25,39 +25,26 @@ from magtwin.tables.quantities import QUANTITIES
 Array = NDArray[np.float64]
 
 PARQUET = (".parquet", ".pq")
-SPREADSHEETS = (".xlsx", ".xls", ".ods")
-"""Suffixes of Parquet and of spreadsheets; other tables are text."""
+SPREADSHEETS = (".xlsx", ".xls", ".ods")  # Suffixes of Parquet and of spreadsheets; other tables are text
 
 _EPOCHS = ((1e17, 1e9, "ns"), (1e14, 1e6, "us"), (1e11, 1e3, "ms"))
 """Least median of times since 1970, ticks per second and unit; below them are seconds."""
 
 _DATE = re.compile(r"\d{1,4}[-/.](\d{1,2}|[A-Za-z]{3})[-/.]\d{1,4}", re.ASCII)
 _CLOCK = re.compile(r"\d{1,3}(:\d\d){1,2}(\.\d*)?", re.ASCII)
-_DAYS = ("%Y-%m-%d", "%d-%m-%Y", "%m-%d-%Y", "%d-%b-%Y")
-"""Orders of a date, with a hyphen for any mark."""
-
-_CLOCKS = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")
-"""Times behind a date."""
-
-_READ = "2025-11-22T08:26:40"
-"""A date as an error message shows it."""
+_DAYS = ("%Y-%m-%d", "%d-%m-%Y", "%m-%d-%Y", "%d-%b-%Y")  # Orders of a date, with a hyphen for any mark
+_CLOCKS = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")  # Times behind a date
+_READ = "2025-11-22T08:26:40"  # A date as an error message shows it
 
 
 @dataclass(frozen=True, eq=False)
 class Column:
     """A column of a table."""
 
-    name: str
-    """Name; "" in a file without a header."""
-
-    cells: Any
-    """N cells: a list of texts, or an array of numbers with nan for empty cells."""
-
-    path: Path
-    """Its file."""
-
-    lines: Sequence[int] | None
-    """Line of each cell in the file; None for files without lines."""
+    name: str  # Name; "" in a file without a header
+    cells: Any  # N cells: a list of texts, or an array of numbers with nan for empty cells
+    path: Path  # Its file
+    lines: Sequence[int] | None  # Line of each cell in the file; None for files without lines
 
     def where(self, row: int) -> str:
         """File and line of a cell."""
@@ -68,14 +55,9 @@ class Column:
 class Table:
     """Columns of equal length."""
 
-    columns: tuple[Column, ...]
-    """In the order of the file or files."""
-
-    notes: tuple[str, ...] = ()
-    """What was repaired."""
-
-    comments: tuple[tuple[int, str], ...] = ()
-    """Number and text of the lines of a text that begin with `#`."""
+    columns: tuple[Column, ...]  # In the order of the file or files
+    notes: tuple[str, ...] = ()  # What was repaired
+    comments: tuple[tuple[int, str], ...] = ()  # Number and text of the lines of a text that begin with `#`
 
     @property
     def rows(self) -> int:
@@ -93,11 +75,7 @@ class Table:
         return self.columns[0].path
 
     def column(self, name: str) -> Column:
-        """A column by its name, by its number from 1, or by its name without the unit in brackets.
-
-        Raises:
-            InputError: There is no such column (the message has the nearest name), or two have that name.
-        """
+        """A column by its name, by its number from 1, or by its name without the unit in brackets."""
         matches = [column for column in self.columns if column.name == name]
         if len(matches) > 1:
             text = f"{len(matches)} columns are called {name!r}; name it by its number"
@@ -116,12 +94,8 @@ class Table:
     def find(self, *symbols: str, apart: Collection[str] = ()) -> list[str]:
         """The columns that hold quantities that belong together, by their names; [] if one has none.
 
-        Args:
-            symbols: Quantities in `magtwin.tables.quantities.QUANTITIES`, such as x and y.
-            apart: Columns that hold something else.
-
-        Raises:
-            InputError: Two columns could be one of them.
+        `symbols` are quantities in `magtwin.tables.quantities.QUANTITIES`, such as x and y, and `apart`
+        columns that hold something else. It is refused if two columns could be one of them.
         """
         labels = [column.name for column in self.columns if column.name not in ("", *apart)]
         matches = {
@@ -148,13 +122,8 @@ class Table:
     def numbers(self, name: str, symbol: str = "") -> Array:
         """The numbers of a column, shape (N,); nan for cells that are empty or nan.
 
-        Args:
-            name: The column, as for `column`.
-            symbol: Its quantity. Its values are then taken from the unit in the label to SI units or nT.
-
-        Raises:
-            InputError: There is no such column, it is in no unit of the quantity, or a cell is not a number;
-                with file and line.
+        With the `symbol` of its quantity, values are taken from the unit in the label to SI units or nT.
+        Errors give file and line of a cell that is no number.
         """
         column = self.column(name)
         factor = 1.0
@@ -204,13 +173,9 @@ class Table:
         """The times of a column [s], shape (N,); nan for cells that are empty or nan.
 
         They are numbers, in the unit of the name or in seconds; times of day, which become seconds since
-        midnight, beyond the next midnight too; or dates and times, which become seconds since 1970: as in
-        ISO 8601, as `2025/11/22 08:26:40` or `22-Nov-2025 08:26:40`, or with day and month in the order that
-        the column proves by a number above 12. One without a zone is in UTC.
-
-        Raises:
-            InputError: There is no such column, a cell is neither, or day and month cannot be told apart;
-                with file and line.
+        midnight, beyond the next midnight too; or dates and times, which become seconds since 1970: as in ISO
+        8601, as `2025/11/22 08:26:40` or `22-Nov-2025 08:26:40`, or with day and month in the order that the
+        column proves by a number above 12. One without a zone is in UTC.
         """
         column = self.column(name)
         is_text = not isinstance(column.cells, np.ndarray) or column.cells.dtype.kind == "O"
@@ -238,11 +203,7 @@ class Table:
         return [str(cell).strip() for cell in self.column(name).cells]
 
     def beside(self, other: "Table") -> "Table":
-        """This table with the columns of another on the right.
-
-        Raises:
-            InputError: The numbers of rows differ.
-        """
+        """This table with the columns of another, of as many rows, on the right."""
         if self.rows != other.rows:
             raise InputError(
                 f"{other.path}: {other.rows} rows, but {self.path} has {self.rows}; "
@@ -252,10 +213,7 @@ class Table:
 
 
 def since_1970(table: Table, name: str) -> tuple[Array, str]:
-    """The times of a column [s], and a note.
-
-    Times without a unit that are far too large for seconds are ms, us or ns since 1970.
-    """
+    """The times of a column [s], those far too large for seconds as ms, us or ns since 1970; and a note."""
     t = table.times(name)
     usual = float(np.median(np.abs(t[np.isfinite(t)]))) if np.isfinite(t).any() else 0.0
     if table.unit(name, "t") not in QUANTITIES["t"].units:
@@ -317,14 +275,8 @@ def read_table(
 ) -> Table:
     """Read a table: Parquet and spreadsheets by their suffix, else text, as `magtwin.tables.delimited` does.
 
-    Args:
-        path: The file.
-        noun: What it is, for error messages.
-        wanted: What a row holds, for error messages.
-        content: The bytes of a text that lies in an archive.
-
-    Raises:
-        InputError: The file is missing, is neither, is damaged, or has no rows.
+    Errors tell its `noun`, and what a row holds, which is `wanted`. `content` are the bytes of a text in an
+    archive.
     """
     if Path(path).suffix.lower() in PARQUET:
         from magtwin.tables.parquet import parquet_columns  # imports pyarrow

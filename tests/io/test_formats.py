@@ -107,6 +107,7 @@ def test_folders_are_read_by_what_is_in_them(run, written, tmp_path):
         read_run(tmp_path / "none")
 
 
+@pytest.mark.filterwarnings("ignore:.*cut short:magtwin.errors.RepairWarning")
 @pytest.mark.parametrize("name", [f"run{suffix}" for suffix, kind in FORMATS.items() if kind.write])
 def test_every_format_refuses_a_file_cut_short_or_of_another_kind(name, written, tmp_path):
     whole = (written / name).read_bytes()
@@ -178,7 +179,7 @@ def test_convert_takes_frames_a_second_units_and_the_scene(run, written, lab_sce
         ("run.parquet", "new.mcap", ["--usd-fps", "5"], "rosbag2 has no option 'fps'"),
         ("run.parquet", "new.db3", [], "rosbag2 in SQLite is read, not written; give .mcap"),
         ("run.parquet", "new.usd", ["--usd-fps", "-5"], "fps must be above 0"),
-        ("run.parquet", "run.parquet", ["--force"], "is the run itself"),
+        ("run.parquet", "run.parquet", ["--force"], "is read by this command and would be replaced"),
         ("runn.csv", "new.parquet", [], "runn.csv: no such run; did you mean 'run.csv'?"),
     ],
 )

@@ -82,7 +82,7 @@ REFUSED = [
     ("import b.csv", "b.csv: no such source of readings"),
     ("import a.csv+b.csv", "b.csv: no such file of readings"),
     ("import a.csv --out a.txt", "ends in .usdc"),
-    ("import a.csv --out a.usdc", "not gridded", "magtwin map fit"),
+    ("import a.csv --out a.usdc", "2 of 2 readings are good", "a map needs 8 at least"),
     ("import a.csv --created yesterday", "--created must be a day YYYY-MM-DD"),
     ("import a.csv --height-m -1", "--height-m", "0 m or more, got -1"),
     ("import a.csv --height-m nan", "--height-m", "got nan"),
@@ -96,7 +96,6 @@ REFUSED = [
     ("fit a.csv --earth 29.65,-82.35,50", "is a field of 100.8 nT"),
     ("fit a.csv --earth 29,-82,50,2050-01-01", "lies beyond the IGRF-14"),
     ("fit a.csv --earth lab.usda", "no file 'lab.usda'"),
-    ("fit none.csv", "--heading none"),
     ("fit deg.csv", "--heading-unit deg"),
     ("fit uv.csv", "--x NAME --y NAME"),
     ("fit strength.csv", "--field NAME", "magtwin map import strength.csv"),
@@ -105,10 +104,9 @@ REFUSED = [
 
 SOURCES = {
     "a.csv": "x,y,yaw,field\n0,0,0,41000\n1,0,0,41500\n",
-    "none.csv": "x,y,field\n0,0,41000\n",
     "deg.csv": "x,y,yaw,field\n0,0,90,41000\n",
     "uv.csv": "u,v,yaw,field\n0,0,0,41000\n",
-    "strength.csv": "x,y,yaw,strength\n0,0,0,41000\n",
+    "strength.csv": "x,y,yaw,qq\n0,0,0,41000\n",
     "m.usdc": "PXR-USDC",
 }
 

@@ -357,8 +357,8 @@ def test_the_viewer_listens_on_this_machine_only_and_ends_with_its_block():
         rows = [line.split() for table in tables for line in table.read_text().splitlines()]
         return [row[1] for row in rows if row[1].endswith(f":{port:04X}") and row[3] == "0A"]
 
-    with live_viewer(headless=True) as (_, client):
-        port = int(client.url.rsplit(":", 1)[1].split("/")[0])
+    with live_viewer(headless=True) as (address, _):
+        port = int(address.rsplit(":", 1)[1].split("/")[0])
         assert listening(port) == [f"0100007F:{port:04X}"]
     assert listening(port) == []
 

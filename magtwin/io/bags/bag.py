@@ -27,29 +27,16 @@ from magtwin.io.bags.writer import CUSTOM, NOTE
 from magtwin.run.arrow import check_metadata
 from magtwin.run.run import Metadata
 
-SUFFIXES: dict[str, Any] = {".mcap": McapReader, ".db3": Db3Reader, ".bag": Ros1Reader}
-"""Readers of storage files, by suffix."""
-
-LONGEST_LINE = 2000
-"""Most characters of an error message."""
+SUFFIXES: dict[str, Any] = {".mcap": McapReader, ".db3": Db3Reader, ".bag": Ros1Reader}  # Readers by suffix
+LONGEST_LINE = 2000  # Most characters of an error message
 
 
 class Bag:
     """An open bag: all of its storage files as one. What is damaged in it is left out, with a warning.
 
-    Args:
-        path: Folder of a rosbag2, or a storage file (.mcap, .db3, or .bag of ROS 1). A truncated file is read
-            up to its last whole chunk.
-
-    Attributes:
-        path: As given.
-        files: Its storage files.
-        topics: Its topics by name.
-        kinds: Message type of each topic; "" if it is not known.
-        packed: How rosbag2 compressed it: "file", "message" or "".
-
-    Raises:
-        InputError: There is no bag, or nothing of it can be read.
+    It is the folder of a rosbag2, or a storage file (.mcap, .db3, or .bag of ROS 1). A truncated file is read
+    up to its last whole chunk. `kinds` are the message types of its `topics`, "" if not known; `packed` tells
+    how rosbag2 compressed it: "file", "message" or "".
     """
 
     def __init__(self, path: Path) -> None:
@@ -71,18 +58,11 @@ class Bag:
                 opened.callback(reader.close)
                 self.readers.append(reader)
                 self._take(reader, about.kinds)
+            if not (all(reader.whole for reader in self.readers) or PARTIAL in self.path.name):
+                text = "cut short: its end is missing; it is read up to its last whole chunk"
+                warnings.warn(f"{self.path}: {text}", RepairWarning, stacklevel=2)
+            self._tell()
             self._opened = opened.pop_all()
-        try:
-            self._warn_of_faults()
-        except BaseException:  # a warning that is an error
-            self._opened.close()
-            raise
-
-    def _warn_of_faults(self) -> None:
-        if not (all(reader.whole for reader in self.readers) or PARTIAL in self.path.name):
-            text = "cut short: its end is missing; it is read up to its last whole chunk"
-            warnings.warn(f"{self.path}: {text}", RepairWarning, stacklevel=2)
-        self._tell()
 
     def _take(self, reader: "McapReader | Db3Reader | Ros1Reader", kinds: Mapping[str, str]) -> None:
         """The topics, types and metadata of a storage file."""
@@ -159,11 +139,7 @@ class Bag:
         return {topic: np.sort(np.concatenate(parts)) for topic, parts in found.items()}
 
     def layout(self, name: str, counts: Mapping[str, Any] | None = None) -> tuple[Leaf, ...]:
-        """The leaves of a topic's type, as `magtwin.io.bags.types.layout`.
-
-        Raises:
-            InputError: The type is not known, nor defined in the bag.
-        """
+        """The leaves of a topic's type, as `magtwin.io.bags.types.layout`, which the bag may define."""
         return self.types.layout(self.kinds[name], counts, ros1=self.topics[name].encoding == "ros1")
 
     def missing(self, name: str) -> InputError:
@@ -208,8 +184,7 @@ class _About(NamedTuple):
 
     custom: dict[str, str]
     packed: str = ""
-    kinds: Mapping[str, str] = MappingProxyType({})
-    """Message types of topics."""
+    kinds: Mapping[str, str] = MappingProxyType({})  # Message types of topics
 
 
 def _files(path: Path) -> tuple[list[Path], _About]:

@@ -21,52 +21,41 @@ from magtwin.errors import InputError
 Bytes = NDArray[np.uint8]
 Index = NDArray[np.int64]
 
-HEADER = 4
-"""Bytes of the encapsulation header before the first leaf."""
-
-MOST_TEXTS = 4096
-"""Largest number of strings in a sequence."""
-
-MOST_PADDING = 64
-"""Largest array for sequences of unequal length, in bytes for each byte of the messages."""
-
-NS = 10**9
-"""Nanoseconds in a second."""
+HEADER = 4  # Bytes of the encapsulation header before the first leaf
+MOST_TEXTS = 4096  # Largest number of strings in a sequence
+MOST_PADDING = 64  # Largest array for sequences of unequal length, in bytes for each byte of the messages
+NS = 10**9  # Nanoseconds in a second
 
 
 @dataclass(frozen=True)
 class Leaf:
     """A number, stamp or string of a message, or several of them in a row."""
 
-    name: str
-    """Path in the message, such as `pose.position`."""
+    name: str  # Path in the message, such as `pose.position`
 
     kind: str
     """numpy code of a number; `time` for int32 seconds and uint32 nanoseconds; `text`; or `none` for a
     sequence that must be empty."""
 
-    count: int | None = 1
-    """How many in a row. None: a sequence, whose length stands in the message."""
+    count: int | None = 1  # How many in a row. None: a sequence, whose length stands in the message.
 
 
 @dataclass(frozen=True, eq=False)
 class Messages:
     """Messages of a topic in one buffer."""
 
-    received: Index
-    """Time of receipt of each [ns], shape (M,)."""
+    received: Index  # Time of receipt of each [ns], shape (M,)
+    buffer: Bytes  # Bytes that hold all of them, shape (B,)
+    start: Index  # Offset of each in the buffer, shape (M,)
+    size: Index  # Bytes of each, shape (M,)
+    packed: bool = False  # Whether they are of ROS 1: without a header of four bytes and without padding
 
-    buffer: Bytes
-    """Bytes that hold all of them, shape (B,)."""
-
-    start: Index
-    """Offset of each in the buffer, shape (M,)."""
-
-    size: Index
-    """Bytes of each, shape (M,)."""
-
-    packed: bool = False
-    """Whether they are those of ROS 1: without a header of four bytes, and without padding."""
+    @classmethod
+    def of(cls, received: Any, sizes: Any, content: bytes | bytearray, *, packed: bool = False) -> "Messages":
+        """Messages whose bytes follow each other, sorted by time of receipt."""
+        size, moments = np.array(sizes, np.int64), np.array(received, np.int64)
+        start = np.cumsum(size) - size
+        return cls(moments, np.frombuffer(content, np.uint8), start, size, packed).in_order()
 
     def __len__(self) -> int:
         return len(self.received)
@@ -83,14 +72,10 @@ class Messages:
 
 
 def encode(leaves: Sequence[Leaf], fields: Mapping[str, Any], rows: int, *, room: int = 0) -> Bytes:
-    """Messages of equal size, one per row, shape (rows, room + size).
+    """Messages of equal size, one per row, shape (rows, room + size); `room` bytes of each are left free.
 
-    Args:
-        leaves: Leaves of the type.
-        fields: Values by leaf name: an array of `rows` rows, or one value for all rows; stamps as int64 [ns];
-            a string or a sequence of strings for all rows. Default: zero or empty.
-        rows: Number of messages.
-        room: Bytes left free at the beginning of each row.
+    `fields` are values by leaf name: an array of `rows` rows, or one value for all rows; stamps as int64
+    [ns]; a string or a sequence of strings for all rows. Default: zero or empty.
     """
     numbers: list[tuple[int, str, NDArray[Any]]] = []
     texts: list[tuple[int, bytes]] = []
@@ -146,19 +131,11 @@ def encode(leaves: Sequence[Leaf], fields: Mapping[str, Any], rows: int, *, room
 
 
 def decode(leaves: Sequence[Leaf], messages: Messages, wanted: Iterable[str]) -> dict[str, Any]:
-    """Values of some leaves of messages.
+    """Values of the `wanted` leaves of messages, by name.
 
-    Args:
-        leaves: Leaves of the type.
-        messages: The messages.
-        wanted: Names of the leaves to read.
-
-    Returns:
-        Values by name: numbers of shape (M,), or (M, n) for n in a row; sequences padded with nan; stamps as
-        int64 [ns]; a list of M strings; a list of M tuples for sequences of strings.
-
-    Raises:
-        InputError: A message is too short for its type, or has another encoding.
+    Numbers have the shape (M,), or (M, n) for n in a row; sequences are padded with nan; stamps are int64
+    [ns]; strings a list of M, and sequences of strings of M tuples. A message that is too short for its type,
+    or has another encoding, is refused.
     """
     left, values_of = set(wanted), {}
     head = 0 if messages.packed else HEADER
@@ -191,12 +168,8 @@ class _Raw(NamedTuple):
     """Bytes of messages, without their headers."""
 
     buffer: Bytes
-    body: Index
-    """Offset of the first leaf of each message."""
-
-    room: Index
-    """Bytes of each from there on."""
-
+    body: Index  # Offset of the first leaf of each message
+    room: Index  # Bytes of each from there on
     packed: bool
 
     def aligned(self, at: Any, size: int) -> Any:

@@ -15,28 +15,18 @@ from magtwin.files.settings import yaml_loader
 from magtwin.io.bags.cdr import Index, Messages
 from magtwin.io.bags.storage import StoredTopic
 
-_STEPS, _STEP = 1_000_000, 10_000
-"""Steps of sqlite's machine that any file may take, and those between two counts."""
+_STEPS, _STEP = 1_000_000, 10_000  # Steps of sqlite's machine that any file may take, and between counts
 
 _STEPS_PER_BYTE = 5
 """Further steps for each byte of a file. A message takes about 20 and has 20 bytes or more, but pages of a
 damaged file can lead to each other again and again."""
 
-_ROWS = 10_000
-"""Most topics of a bag."""
-
-MOST_QOS = 4_000
-"""Characters of the quality of service of a topic that are read."""
+_ROWS = 10_000  # Most topics of a bag
+MOST_QOS = 4_000  # Characters of the quality of service of a topic that are read
 
 
 class Db3Reader:
-    """A .db3 file: its topics, its metadata, and its messages on demand.
-
-    Attributes:
-        topics: Its topics.
-        notes: The custom data that a .db3 file holds.
-        definitions: Encoding and text of the definition of each message type, as far as it holds them.
-    """
+    """A .db3 file: its topics, and its messages on demand; attributes as those of `McapReader`."""
 
     whole, chunks = True, 0
     compression = frozenset[str]()
@@ -85,12 +75,7 @@ class Db3Reader:
             times.append(received)
             sizes.append(len(data))
             contents += data
-        joined = {}
-        for number, (times, sizes, contents) in found.items():
-            size, moments = np.array(sizes, np.int64), np.array(times, np.int64)
-            buffer = np.frombuffer(contents, np.uint8)
-            joined[number] = Messages(moments, buffer, np.cumsum(size) - size, size).in_order()
-        return joined
+        return {number: Messages.of(*parts) for number, parts in found.items()}
 
     def _spent(self) -> bool:
         """Whether sqlite has to give up."""
@@ -99,11 +84,7 @@ class Db3Reader:
 
 
 def _tables(database: sqlite3.Connection) -> set[str]:
-    """Names of its tables, in lower case, as sqlite ignores the case.
-
-    Raises:
-        InputError: A table is missing; or contents are computed, as a few bytes can make rows without end.
-    """
+    """Names of its tables, in lower case; computed ones are refused: they can have rows without end."""
     tables = set()
     for name, sql in database.execute("SELECT CAST(name AS BLOB), sql FROM sqlite_master"):
         name = (name or b"").decode(errors="replace").lower()

@@ -13,11 +13,8 @@ from magtwin.io.bags.topics import FIELD, OCCUPANCY, Topic
 if TYPE_CHECKING:
     from magtwin.twin import Twin
 
-FLOAT32 = 7
-"""sensor_msgs/PointField.FLOAT32."""
-
-MOST_NODES = 100_000
-"""Largest number of nodes of an anomaly map that is shown; of a larger one, every few nodes."""
+FLOAT32 = 7  # sensor_msgs/PointField.FLOAT32
+MOST_NODES = 100_000  # Most nodes of an anomaly map that are shown; of more, every few nodes
 
 
 def lab_fields(twin: "Twin", frame: str) -> dict[Topic, dict[str, Any]]:

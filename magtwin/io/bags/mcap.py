@@ -30,33 +30,17 @@ from magtwin.io.bags.storage import ROOM, Batch, Connection, StoredTopic, in_tim
 
 MAGIC = b"\x89MCAP0\r\n"
 
-CHUNK = 1 << 20
-"""Approximate bytes of a chunk before compression."""
-
-LARGEST_CHUNK = BUDGETS["bag"].count
-"""Largest chunk that is read [bytes]."""
-
-MOST_RATIO = 1000
-"""Largest compression ratio that is accepted, beyond `SPARE`."""
-
-SPARE = 1 << 26
-"""Bytes that the chunks of a file may hold beyond `MOST_RATIO`: blank images compress to almost nothing."""
-
-LEVEL = 1
-"""Compression level of zstd."""
-
-FOOTER = 29
-"""Bytes of the record that ends a file."""
-
-PRIVATE = 0x80
-"""Opcodes from which a record is of no concern."""
-
-_DAMAGED = (ValueError, struct.error, McapError, IndexError, OverflowError)
-"""What the library raises for a damaged record."""
+CHUNK = 1 << 20  # Approximate bytes of a chunk before compression
+LARGEST_CHUNK = BUDGETS["bag"].count  # Largest chunk that is read [bytes]
+MOST_RATIO = 1000  # Largest compression ratio that is accepted, beyond `SPARE`
+SPARE = 1 << 26  # Bytes that chunks may hold beyond `MOST_RATIO`: blank images compress to almost none
+LEVEL = 1  # Compression level of zstd
+FOOTER = 29  # Bytes of the record that ends a file
+PRIVATE = 0x80  # Opcodes from which a record is of no concern
+_DAMAGED = (ValueError, struct.error, McapError, IndexError, OverflowError)  # Raised for damaged records
 
 _HEAD = struct.Struct("<BQ")
-_RECORD = struct.Struct("<BQH")
-"""Opcode and length of a record, and the channel of a message."""
+_RECORD = struct.Struct("<BQH")  # Opcode and length of a record, and the channel of a message
 
 
 def _bytes(record: records.McapRecord) -> bytes:
@@ -76,10 +60,8 @@ class McapWriter:
         self._pending = b""  # schemas and channels that the next chunk begins with
         self._chunks: list[records.ChunkIndex] = []
         self._metadata: list[records.MetadataIndex] = []
-        self.counts: dict[int, int] = {}
-        """Messages by connection."""
-        self.first, self.last = 2**63 - 1, 0
-        """Times of the first and the last message [ns]."""
+        self.counts: dict[int, int] = {}  # Messages by connection
+        self.first, self.last = 2**63 - 1, 0  # Times of the first and the last message [ns]
 
     def add(self, connection: Connection) -> None:
         """Register a topic, before its first message."""
@@ -232,16 +214,10 @@ class McapReader:
     """An MCAP file: its topics, its metadata, and its messages on demand.
 
     A damaged record costs itself, and a damaged chunk its messages: records are walked through from the
-    beginning, and from a damaged one on by the index at the end of the file.
-
-    Attributes:
-        topics: Its channels.
-        notes: Metadata records by name; the last one if several have the same name.
-        definitions: Encoding and text of the definition of each message type.
-        whole: Whether the file has its end.
-        chunks: Number of its chunks.
-        compression: Names of their compressions.
-        damaged: Places of what could not be read so far.
+    beginning, and from a damaged one on by the index at the end of the file. `topics` are its channels,
+    `notes` metadata records by name, `definitions` encoding and text of message types; `whole` tells whether
+    it has its end, `compression` how its `chunks` are packed, and `damaged` the places of what could not be
+    read so far.
     """
 
     def __init__(self, path: Path) -> None:
@@ -274,16 +250,10 @@ class McapReader:
             self.close()
             raise
         self.chunks = len(self._chunks)
-        self.topics = [
-            StoredTopic(
-                c.id,
-                c.topic,
-                self._schemas.get(c.schema_id, ""),
-                c.message_encoding,
-                c.metadata.get("offered_qos_profiles", ""),
-            )
-            for c in self._channels.values()
-        ]
+        self.topics: list[StoredTopic] = []
+        for c in self._channels.values():
+            kind, qos = self._schemas.get(c.schema_id, ""), c.metadata.get("offered_qos_profiles", "")
+            self.topics.append(StoredTopic(c.id, c.topic, kind, c.message_encoding, qos))
 
     def close(self) -> None:
         """Close the file."""

@@ -1,5 +1,6 @@
 """ros1: bags of ROS 1 (.bag), read by rosbags; their messages are decoded like those of ROS 2."""
 
+from array import array
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,7 @@ from magtwin.files.budget import check_decoded
 from magtwin.io.bags.cdr import Index, Messages
 from magtwin.io.bags.storage import StoredTopic
 
-_NOW = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
-"""Types that have another name today."""
+_NOW = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}  # Types that have another name today
 
 
 class Ros1Reader:
@@ -49,21 +49,18 @@ class Ros1Reader:
 
     def messages(self, ids: Collection[int], most: int | None = None) -> dict[int, Messages]:
         """The messages of some topics in the order of receipt; of about the first `most` bytes."""
-        parts: dict[int, list[tuple[int, bytes]]] = {number: [] for number in ids}
+        parts = {number: (array("q"), array("q"), bytearray()) for number in ids}
         chosen, held = [each for each in self._bag.connections if each.id in parts], 0
         for connection, received, data in self._bag.messages(chosen) if chosen else ():
             held += len(data)
             check_decoded(self._path, self._size, held)
             if most is not None and held > most:
                 break
-            parts[connection.id].append((received, data))
-        joined = {}
-        for number, rows in parts.items():
-            size = np.array([len(data) for _, data in rows], np.int64)
-            moments = np.array([received for received, _ in rows], np.int64)
-            buffer = np.frombuffer(b"".join(data for _, data in rows), np.uint8)
-            joined[number] = Messages(moments, buffer, np.cumsum(size) - size, size, packed=True).in_order()
-        return joined
+            times, sizes, contents = parts[connection.id]
+            times.append(received)
+            sizes.append(len(data))
+            contents += data
+        return {number: Messages.of(*several, packed=True) for number, several in parts.items()}
 
 
 def _name(decompressor: Any) -> str:

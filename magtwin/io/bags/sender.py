@@ -23,8 +23,7 @@ class FixedFrame:
     name: str
     p: Vec3 = ZERO3
     q_xyzw: Quat = IDENTITY_XYZW
-    axis: Vec3 = (0.0, 0.0, 1.0)
-    """Axis about which a wheel that rolls forward turns by a positive angle."""
+    axis: Vec3 = (0.0, 0.0, 1.0)  # Axis about which a wheel that rolls forward turns by a positive angle
 
 
 @dataclass(frozen=True)
@@ -32,10 +31,8 @@ class WheelJoint:
     """The joint of a driven wheel."""
 
     name: str
-    side: int
-    """0 for left, 1 for right."""
-    sense: int = 1
-    """-1 if the wheel rolls backward as the joint's angle grows."""
+    side: int  # 0 for left, 1 for right
+    sense: int = 1  # -1 if the wheel rolls backward as the joint's angle grows
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,9 +42,7 @@ class Sender:
     map_frame: str = "map"
     odom_frame: str = "odom"
     base_frame: str = "base_link"
-    truth_frame: str = "ground_truth"
-    """Frame at the true pose of base_link, in the map; on /tf if the map is not the parent of odom."""
-
+    truth_frame: str = "ground_truth"  # True pose of base_link in map; on /tf if that is not odom's parent
     imu_frame: str = "imu_link"
     magnetometer_frame: str = "magnetometer_link"
     lidar_frame: str = "rplidar_link"
@@ -60,52 +55,24 @@ class Sender:
     transforms: Transforms = "all"
     """Transforms of the drive on /tf. With "all", map to odom puts base_link at its true pose."""
 
-    unit: Unit = "T"
-    """Unit of magnetic fields in messages."""
-
-    odometry_std: tuple[float, ...] = (0.0,) * 6
-    """Standard deviation of odometry's velocities, linear [m/s] and angular [rad/s]."""
-
-    orientation_std: float = 0.0
-    """Standard deviation of each small angle of the IMU's orientation [rad]."""
-
-    gyro_std: float = 0.0
-    """Standard deviation of the gyroscope at rest [rad/s]."""
-
-    gyro_vibration: Vec3 = ZERO3
-    """Additional gyroscope noise per speed [rad/m]."""
-
-    accel_std: float = 0.0
-    """Standard deviation of the accelerometer at rest [m/s2]."""
-
-    accel_vibration: Vec3 = ZERO3
-    """Additional accelerometer noise per speed [1/s]."""
-
-    vector_std_nt: float = 0.0
-    """Standard deviation of each vector axis of the magnetometer [nT]."""
-
+    unit: Unit = "T"  # Unit of magnetic fields in messages
+    odometry_std: tuple[float, ...] = (0.0,) * 6  # Of odometry's velocities, [m/s] and [rad/s]
+    orientation_std: float = 0.0  # Standard deviation of each small angle of the IMU's orientation [rad]
+    gyro_std: float = 0.0  # Standard deviation of the gyroscope at rest [rad/s]
+    gyro_vibration: Vec3 = ZERO3  # Additional gyroscope noise per speed [rad/m]
+    accel_std: float = 0.0  # Standard deviation of the accelerometer at rest [m/s2]
+    accel_vibration: Vec3 = ZERO3  # Additional accelerometer noise per speed [1/s]
+    vector_std_nt: float = 0.0  # Standard deviation of each vector axis of the magnetometer [nT]
     scan_rate_hz: float = 0.0
     range_m: tuple[float, float] = (0.0, 0.0)
 
-    links: tuple[FixedFrame, ...] = ()
-    """Links fixed in base_link, and sensors mounted at an angle on their links."""
-
-    wheels: tuple[FixedFrame, ...] = ()
-    """The wheels of `wheel_joints` at rest; empty if they are not known."""
-
-    description: str = ""
-    """The robot's URDF; "" if unknown."""
+    links: tuple[FixedFrame, ...] = ()  # Links fixed in base_link, and sensors at an angle on their links
+    wheels: tuple[FixedFrame, ...] = ()  # The wheels of `wheel_joints` at rest; empty if they are not known
+    description: str = ""  # The robot's URDF; "" if unknown
 
 
 def sender_of(robot: RobotSpec, *, unit: Unit = "T", rate_hz: float | None = None, **rest: Any) -> Sender:
-    """The sender of a robot's messages.
-
-    Args:
-        robot: Its sensors and drive.
-        unit: Unit of magnetic fields in messages.
-        rate_hz: Rate of the magnetometer [Hz]. Default: the robot's.
-        rest: `links`, `wheels`, `wheel_joints` and `description` of the sender.
-    """
+    """The sender of a robot's messages at a rate of the magnetometer [Hz]; `rest` are fields of `Sender`."""
     mounts = {"magnetometer": robot.magnetometer, "imu": robot.imu, "lidar": robot.lidar}
     frames, tilted = {}, []
     for name, mount in mounts.items():

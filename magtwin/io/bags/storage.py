@@ -13,14 +13,9 @@ from numpy.typing import NDArray
 from magtwin.io.bags.cdr import Bytes, Index
 from magtwin.io.bags.topics import Qos
 
-VERSION = 8
-"""Version of metadata.yaml: the newest one that ROS 2 Humble reads."""
-
-ROOM = 31
-"""Bytes left free before each message of a batch, for the head of an MCAP message record."""
-
-PARTIAL = ".partial"
-"""Inserted before the suffix of a bag until it ends."""
+VERSION = 8  # Version of metadata.yaml: the newest one that ROS 2 Humble reads
+ROOM = 31  # Bytes left free before each message of a batch, for the head of an MCAP message record
+PARTIAL = ".partial"  # Inserted before the suffix of a bag until it ends
 
 
 def partial_of(path: Path) -> Path:
@@ -34,15 +29,9 @@ class Connection:
 
     id: int
     topic: str
-    kind: str
-    """Message type."""
-
-    definition: str
-    """Definition of the type and of the types in it, as text."""
-
-    digest: str
-    """REP 2011 hash of the definition."""
-
+    kind: str  # Message type
+    definition: str  # Definition of the type and of the types in it, as text
+    digest: str  # REP 2011 hash of the definition
     qos: Qos
 
     @cached_property
@@ -62,14 +51,9 @@ class Batch(NamedTuple):
     """Messages of one topic and one size, sorted by time. A topic may have several batches."""
 
     connection: Connection
-    received: Index
-    """Time of receipt [ns], shape (M,)."""
-
-    rows: Bytes
-    """One message per row, after `ROOM` free bytes, shape (M, ROOM + size)."""
-
-    arrival: Index | None = None
-    """Rank among messages with the same time, shape (M,). Default: the order of the batches."""
+    received: Index  # Time of receipt [ns], shape (M,)
+    rows: Bytes  # One message per row, after `ROOM` free bytes, shape (M, ROOM + size)
+    arrival: Index | None = None  # Rank among messages of one time, (M,). Default: the order of the batches.
 
 
 class StoredTopic(NamedTuple):
@@ -78,11 +62,8 @@ class StoredTopic(NamedTuple):
     id: int
     topic: str
     kind: str
-    encoding: str
-    """Encoding of its messages; "cdr" and "ros1" can be read."""
-
-    qos: str = ""
-    """Quality of service that its publishers offered, as YAML; "" if unknown."""
+    encoding: str  # Encoding of its messages; "cdr" and "ros1" can be read
+    qos: str = ""  # Quality of service that its publishers offered, as YAML; "" if unknown
 
 
 def bag_metadata(
@@ -92,10 +73,7 @@ def bag_metadata(
     span: tuple[int, int],
     custom: Any,
 ) -> dict[str, Any]:
-    """The content of metadata.yaml, below `rosbag2_bagfile_information`, of a bag of one MCAP file.
-
-    `counts` are messages by connection; `span` are the times of the first and the last message [ns].
-    """
+    """`rosbag2_bagfile_information` of metadata.yaml; `span` are the first and last time [ns]."""
     count = sum(counts.values())
     begin = {"nanoseconds_since_epoch": span[0] if count else 0}
     duration = {"nanoseconds": span[1] - span[0] if count else 0}

@@ -22,42 +22,28 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-LATEST_S = 2.0**31
-"""First time that ROS stamps cannot hold [s]."""
+LATEST_S = 2.0**31  # First time that ROS stamps cannot hold [s]
 
 
 @dataclass
 class _Last:
     """State of a topic at the end of the previous rows."""
 
-    values: dict[str, Any] = field(default_factory=dict)
-    """Its columns in the last row; empty before the first."""
-
-    changed_s: float = 0.0
-    """When they last changed [s]."""
-
-    times: int = 0
-    """How often they were sent again since."""
+    values: dict[str, Any] = field(default_factory=dict)  # Its columns in the last row; empty before it
+    changed_s: float = 0.0  # When they last changed [s]
+    times: int = 0  # How often they were sent again since
 
 
-Sent = tuple[Topic, Index, dict[str, Any]]
-"""A topic, the times of some of its messages [ns], and their fields."""
+Sent = tuple[Topic, Index, dict[str, Any]]  # A topic, times of some of its messages [ns], and their fields
 
 
 class Stream:
     """The messages of a run, rows after rows; remembers what was sent last.
 
-    Args:
-        run: Some rows, which define the columns.
-        sender: The robot.
-        lab: Fields of messages about the lab, by topic, which are sent once.
-        scans: The LiDAR's scans of the whole run; None sends no scans.
-        topics: Topics to send, as far as the run has their columns.
-        whole: Put every column into /magtwin/reading, not only those that no other topic carries, and the
-            run's metadata into /magtwin/columns: a recorder of live topics has no other source for them.
-
-    Raises:
-        InputError: A column cannot stand in a bag.
+    The rows of `run` define the columns. `lab` are fields of messages about the lab, which are sent once;
+    `scans` the LiDAR's of the whole run. A `whole` stream puts every column into /magtwin/reading, not only
+    those that no other topic carries, and the run's metadata into /magtwin/columns: a recorder of live topics
+    has no other source for them.
     """
 
     def __init__(
@@ -72,8 +58,7 @@ class Stream:
     ) -> None:
         self._sender, self._scans, self._lab = sender, scans, lab
         self._t, self._stamp = -np.inf, -1
-        self.later_s = _later_s(run)
-        """Time by which stamps are later than t, so that none is below 0 [s]."""
+        self.later_s = _later_s(run)  # Time by which stamps are later than t, so that none is below 0 [s]
         self._last: dict[str, _Last] = {}
         columns = set(run)
         sent = [t for t in topics if t.needs and columns.issuperset(t.needs)]
@@ -90,15 +75,10 @@ class Stream:
             *[DESCRIPTION] * bool(sender.description),
             *lab,
         ]
-        self.topics = [*once, *sent, *([] if scans is None else [SCAN]), READING]
-        """Topics that are sent."""
+        self.topics = [*once, *sent, *([] if scans is None else [SCAN]), READING]  # Topics that are sent
 
     def messages(self, run: Run) -> Iterator[Sent]:
-        """The messages of some rows.
-
-        Raises:
-            InputError: The columns differ from the first rows, or time does not ascend.
-        """
+        """The messages of some rows, which have the same columns as the first and later times."""
         if {name: (values.dtype, values.shape[1:]) for name, values in run.items()} != self._columns:
             raise InputError(f"rows of a bag must have the same columns, {', '.join(self._columns)}")
         t, stamps = self._checked(run)

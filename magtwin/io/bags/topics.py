@@ -32,8 +32,7 @@ class Qos:
 
     depth: int = 10
     reliable: bool = True
-    latched: bool = False
-    """Whether late subscribers get the last message (transient local)."""
+    latched: bool = False  # Whether late subscribers get the last message (transient local)
 
     @property
     def heard(self) -> "Qos":
@@ -52,29 +51,18 @@ class Topic:
     """A topic: its name, its message type, and the columns that it carries."""
 
     name: str
-    kind: str
-    """Message type."""
-
+    kind: str  # Message type
     qos: Qos = field(default_factory=Qos)
-
-    needs: tuple[str, ...] = ()
-    """Columns without which it is not written."""
-
-    carried: bool = False
-    """Whether a bag's reader takes the columns of `needs` from this topic."""
+    needs: tuple[str, ...] = ()  # Columns without which it is not written
+    carried: bool = False  # Whether a bag's reader takes the columns of `needs` from this topic
 
     sent: Literal["changed", "each", "ticks", "once"] = "changed"
     """When messages are sent: when a needed column changes and again every `every_s` while it stays; at each
     reading that has a value; in even steps of `every_s`; or once."""
 
-    every_s: float = 0.1
-    """Time after which an unchanged value is sent again, or the length of a step [s]."""
-
-    lost: str = ""
-    """Column of flags that suspend sending again."""
-
-    frame: str = ""
-    """Attribute of the sender with the frame of the header. Default: no header."""
+    every_s: float = 0.1  # Time after which an unchanged value is sent again, or the length of a step [s]
+    lost: str = ""  # Column of flags that suspend sending again
+    frame: str = ""  # Attribute of the sender with the frame of the header. Default: no header.
 
     by: tuple[str, ...] = ()
     """Columns of flags that select the text of a message; messages are written for equal flags at a time."""
@@ -257,8 +245,6 @@ def _diagnosed(c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
         fields |= {
             f"status.{k}.name": name,
             f"status.{k}.level": max((level for level, _ in faults), default=0),
-        }
-        fields |= {
             f"status.{k}.message": "; ".join(text for _, text in faults) or "ok",
             f"status.{k}.values": 0,
         }

@@ -11,16 +11,11 @@ from magtwin.io.bags.sender import FixedFrame, Sender, Unit, WheelJoint, sender_
 if TYPE_CHECKING:
     from magtwin.twin import Twin
 
-FOOTPRINT = "base_footprint"
-"""Name of the frame below base_link on the floor, as in REP 120."""
+FOOTPRINT = "base_footprint"  # Name of the frame below base_link on the floor, as in REP 120
 
 
 def sender_for(twin: "Twin | None", unit: Unit, rate_hz: Any = None) -> Sender:
-    """The sender of a twin's robot; without a twin, a robot of default frames and unknown noise.
-
-    Raises:
-        InputError: The unit is neither T nor nT.
-    """
+    """The sender of a twin's robot; without a twin, a robot of default frames and unknown noise."""
     if unit not in ("T", "nT"):
         raise InputError(f'units of a bag must be "T" or "nT", got {unit!r}')
     if twin is None:

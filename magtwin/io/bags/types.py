@@ -13,8 +13,7 @@ _CODES |= {f"{sign}int{8 * size}": f"{sign[:1] or 'i'}{size}" for sign in ("u", 
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 """Types of stamps, one leaf of whole nanoseconds."""
 
-MOST_TEXT, MOST_LEAVES, DEEPEST = 200_000, 20_000, 30
-"""Limits of a definition in a bag: characters, parts, and depth of structures."""
+MOST_TEXT, MOST_LEAVES, DEEPEST = 200_000, 20_000, 30  # Of a definition: characters, parts, depth
 
 
 @cache
@@ -42,12 +41,8 @@ def typestore() -> Any:
 def definition_of(kind: str, digest: str = "") -> tuple[str, str]:
     """The definition of a message type as text, and its REP 2011 hash.
 
-    Args:
-        kind: The type.
-        digest: Hash of the wanted definition, as distributions may differ. Default: that of `typestore`.
-
-    Raises:
-        InputError: The type is unknown, or no distribution defines it with that hash.
+    `digest` is the hash of the wanted definition, as distributions may differ; by default that of
+    `typestore`.
     """
     fields_of(kind)
     for store in (typestore(), *map(store_of, ("jazzy", "latest"))):
@@ -57,11 +52,7 @@ def definition_of(kind: str, digest: str = "") -> tuple[str, str]:
 
 
 def fields_of(kind: str) -> list[tuple[str, Any]]:
-    """Name and rosbags description of each field of a message type.
-
-    Raises:
-        InputError: The type is unknown.
-    """
+    """Name and rosbags description of each field of a message type."""
     known = typestore().fielddefs
     if kind not in known:
         raise InputError(f"unknown message type {kind!r}; {hint(kind, known)}")
@@ -103,19 +94,11 @@ class Types:
 
 
 def layout(kind: str, counts: Mapping[str, Any] | None = None) -> tuple[Leaf, ...]:
-    """The leaves of a message type, in the order of its bytes.
+    """The leaves of a message type, such as `sensor_msgs/msg/Imu`, in the order of its bytes.
 
     `geometry_msgs/msg/Point` and other structures of equal numbers are one leaf. A sequence of structures,
     such as `transforms` of a TFMessage, is a leaf with its length, and the leaves `transforms.0.header.stamp`
-    and so on of each element.
-
-    Args:
-        kind: The type, such as `sensor_msgs/msg/Imu`.
-        counts: Lengths of sequences of structures, by leaf name; other entries are ignored. A sequence
-            without a length must be empty.
-
-    Raises:
-        InputError: The type is unknown.
+    and so on of each element. `counts` are lengths of such sequences by leaf name; others must be empty.
     """
     plain = _layout(kind)
     return (

@@ -30,17 +30,10 @@ if TYPE_CHECKING:
     from magtwin.sim.sensors.lidar import Scans
     from magtwin.twin import Twin
 
-CUSTOM = "magtwin."
-"""Prefix of a run's metadata in a bag's custom data; the values are JSON."""
-
-NOTE = "magtwin"
-"""Metadata record of an MCAP file that holds a run's metadata."""
-
-BLOCK = 16_384
-"""Rows written at a time."""
-
-INSIDE = "run.mcap"
-"""Name that a single storage file gives itself, so that its bytes do not depend on the one that it has."""
+CUSTOM = "magtwin."  # Prefix of a run's metadata in a bag's custom data; the values are JSON
+NOTE = "magtwin"  # Metadata record of an MCAP file that holds a run's metadata
+BLOCK = 16_384  # Rows written at a time
+INSIDE = "run.mcap"  # Name that a single file gives itself: its bytes do not depend on the one that it has
 
 
 def write_bag(
@@ -58,7 +51,7 @@ def write_bag(
     readings first have its value, and again while it stays. Stamps are simulation time: t = 0 is 0 ns.
 
     Args:
-        run: The run; its t ascends from 0 or later.
+        run: The run; its t ascends. Whole seconds are added to a t below 0, with a warning.
         path: The folder to make, or a single file, which ends in .mcap.
         twin: The twin of the run: gives frames, covariances, /tf_static and the robot's description.
         units: Unit of magnetic fields: "T", as in ROS, or "nT", as APRILab's robot publishes them.
@@ -172,8 +165,7 @@ class RawBagWriter:
         self.path, self._force = Path(path), force
         check_suffix(self.path)
         check_free(self.path, force=force)
-        self.partial = partial_of(self.path)
-        """Path until it ends."""
+        self.partial = partial_of(self.path)  # Path until it ends
         if self.partial.exists() and not force:
             raise InputError(
                 f"{self.partial}: left by a recording that did not end; read and remove it, or give --force"
@@ -186,17 +178,7 @@ class RawBagWriter:
         self._arrived = 0
 
     def add(self, topic: str, kind: str, qos: Qos, *, digest: str = "") -> None:
-        """Register a topic, before its first message.
-
-        Args:
-            topic: Its name.
-            kind: Its message type.
-            qos: Its quality of service.
-            digest: As for `magtwin.io.bags.types.definition_of`.
-
-        Raises:
-            InputError: Its message type is unknown.
-        """
+        """Register a topic, before its first message; `digest` as for `types.definition_of`."""
         if topic not in self._bag.connections:
             try:
                 with one_line(self.path):
@@ -247,11 +229,7 @@ class RawBagWriter:
 
 
 def check_suffix(path: Path) -> None:
-    """Refuse a path that is no bag's to be written.
-
-    Raises:
-        InputError: So it is.
-    """
+    """Refuse a path that is no bag's to be written."""
     if path.suffix.lower() not in ("", ".mcap", PARTIAL):
         raise InputError(
             f"{path}: a bag is a folder, without a suffix, or a file that ends in .mcap; ros2 bag convert "

@@ -22,20 +22,11 @@ from magtwin.io.surveys.doctor import examine
 from magtwin.report.report import Figure, Report
 from magtwin.run.run import Run
 
-WHOLE = 400_000_000
-"""Bytes of the largest bag whose field is examined as a whole; of a larger one, its beginning is."""
-
-BEGINNING = 100_000_000
-"""Bytes of the beginning of a larger bag that are examined."""
-
-FIRST = 8_000_000
-"""Bytes of messages from whose headers frames and delays are read."""
-
-ANOTHER_S = 3600.0
-"""Delays beyond this are those of another clock [s]."""
-
-GAP = 5.0
-"""Intervals longer than this multiple of the median are gaps."""
+WHOLE = 400_000_000  # Bytes of the largest bag whose field is examined as a whole; else its beginning is
+BEGINNING = 100_000_000  # Bytes of the beginning of a larger bag that are examined
+FIRST = 8_000_000  # Bytes of messages from whose headers frames and delays are read
+ANOTHER_S = 3600.0  # Delays beyond this are those of another clock [s]
+GAP = 5.0  # Intervals longer than this multiple of the median are gaps
 
 NEXT = {
     "fit for a map": "magtwin map fit {bag} --out map.usdc",
@@ -48,12 +39,7 @@ NEXT = {
 def info_of_bag(path: Path, **reading: Any) -> Report:
     """A report on a bag: its span, storage, topics and roles; and on its field and what it is fit for.
 
-    Args:
-        path: The bag.
-        reading: `topics`, `unit` and `scale` of `magtwin.io.bags.read_bag`.
-
-    Raises:
-        InputError: There is no bag, nothing of it can be read, or an option is wrong.
+    `reading` are `topics`, `unit` and `scale` of `magtwin.io.bags.read_bag`.
     """
     with Bag(path) as bag, np.errstate(over="ignore", invalid="ignore"):
         size = sum(file.stat().st_size for file in bag.files)
@@ -113,12 +99,10 @@ def _field(bag: Bag, most: int | None, reading: Mapping[str, Any]) -> tuple[Repo
     assert recording is not None
     run, said = recording.run, recording.run.metadata
     told |= {"taken": said["taken"]} if "taken" in said else {}
-    told |= {"doubts": texts} if texts else {}
     report = _examined(run, roles, f"{said['field_unit']}, {said['field_unit_told']}")
     fit = {use: str(report.metadata[use]) for use in NEXT}
-    doubts_of_field = report.metadata.get("doubts", [])
-    if doubts_of_field:
-        told["doubts"] = [*texts, *doubts_of_field]
+    if texts := [*texts, *report.metadata.get("doubts", [])]:
+        told["doubts"] = texts
     if own:
         told["written by"] = "magtwin; magtwin report, view and reproduce take it"
     line = next((NEXT[use] for use in NEXT if fit[use].startswith("yes")), "")

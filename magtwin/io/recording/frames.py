@@ -29,8 +29,7 @@ from magtwin.io.recording.roles import Role
 
 Array = NDArray[np.float64]
 Columns = Mapping[str, NDArray[Any]]
-Frames = tuple[str, str]
-"""Frame of the header and child frame of a message; "" if it has none."""
+Frames = tuple[str, str]  # Frame of the header and child frame of a message; "" if it has none
 
 LEAVES = ("header.frame_id", "child_frame_id")
 
@@ -43,36 +42,20 @@ WORDS: Mapping[str, str] = {
 }
 """Words in names of frames that stand still, of parts of a robot, and of its base; the first match counts."""
 
-TURNED_RAD, MOVED_M = 1e-6, 1e-6
-"""Turns [rad] and distances [m] below which a transform is none."""
+TURNED_RAD, MOVED_M = 1e-6, 1e-6  # Turns [rad] and distances [m] below which a transform is none
+TILTED_M_S2 = 0.5  # Difference of mean upward accelerations by which gravity decides [m/s2]
+MOST_TRANSFORMS = 256  # Messages of more transforms are not read
 
-TILTED_M_S2 = 0.5
-"""Difference of the mean upward accelerations from which gravity decides what an orientation is of [m/s2]."""
-
-MOST_TRANSFORMS = 256
-"""Messages of more transforms are not read."""
-
-_TRANSFORM = (
-    "header.stamp",
-    "header.frame_id",
-    "child_frame_id",
-    "transform.translation",
-    "transform.rotation",
-)
+_TRANSFORM = ("header.stamp", *LEAVES, "transform.translation", "transform.rotation")
 
 
 class Mount(NamedTuple):
     """A frame at rest on the robot."""
 
     name: str
-    base: str
-    """Name of the robot's base."""
-
-    p: Array
-    """Origin of the frame in base [m], shape (3,)."""
-
-    q_xyzw: Array
-    """Axes of the frame in base, shape (4,)."""
+    base: str  # Name of the robot's base
+    p: Array  # Origin of the frame in base [m], shape (3,)
+    q_xyzw: Array  # Axes of the frame in base, shape (4,)
 
     def __str__(self) -> str:
         place = ", ".join(f"{part + 0:.3g}" for part in np.round(self.p, 4))
@@ -116,12 +99,11 @@ class StaticFrames:
         The base is base_link if the two are in one tree, else base_footprint, else another base.
         """
         name = plain(frame)
-        if name not in self.parents and all(parent != name for parent, *_ in self.parents.values()):
+        known = dict.fromkeys(chain(self.parents, (parent for parent, *_ in self.parents.values())))
+        if name not in known:
             return None
         root, p, q = self._in_root(name)
-        bases = [
-            other for other in self._names() if kind_of(other) == "base" and self._in_root(other)[0] == root
-        ]
+        bases = [other for other in known if kind_of(other) == "base" and self._in_root(other)[0] == root]
         ranks = ("base_link", "base_footprint")
         bases.sort(key=lambda other: [not other.endswith(rank) for rank in ranks])
         if not bases or name in bases:
@@ -129,10 +111,6 @@ class StaticFrames:
         _, p_base, q_base = self._in_root(bases[0])
         back = quat_conjugate(q_base)
         return Mount(name, bases[0], rotate(back, p - p_base), quat_multiply(back, q))
-
-    def _names(self) -> list[str]:
-        """All frames, each once."""
-        return list(dict.fromkeys(chain(self.parents, (parent for parent, *_ in self.parents.values()))))
 
     def _in_root(self, name: str) -> tuple[str, Array, Array]:
         """The root of a frame's tree, and the frame's origin and axes there."""
@@ -160,16 +138,9 @@ def kind_of(frame: str) -> str:
 
 
 def mount_of(role: Role, frames: Frames, known: StaticFrames) -> tuple[Mount | None, str]:
-    """Where the frame of messages is on the robot, and what is wrong with it.
+    """Where the frame of messages is on the robot, and what is wrong with it; "" if nothing is.
 
-    Args:
-        role: The role of the messages.
-        frames: Their frames.
-        known: The transforms.
-
-    Returns:
-        The mount of a part of the robot, None for base_link and for a frame whose place is not known; and the
-        fault, "" if there is none.
+    No mount: it is base_link, or its place is not known by the transforms.
     """
     header, child = map(plain, frames)
     stands = kind_of(header) == "fixed"
@@ -191,7 +162,7 @@ def mount_of(role: Role, frames: Frames, known: StaticFrames) -> tuple[Mount | N
 
 
 def in_base(role: Role, columns: Columns, mount: Mount) -> dict[str, NDArray[Any]]:
-    """The columns of messages of a part of the robot as those of its base.
+    """The columns of messages of a part of the robot, by its mount, as those of the robot's base.
 
     With p_base_part and q_base_part of the mount, vectors are rotate(q_base_part, v_part), poses are
 
@@ -201,11 +172,6 @@ def in_base(role: Role, columns: Columns, mount: Mount) -> dict[str, NDArray[Any
     and the velocity of base is v_base = rotate(q_base_part, v_part) - w_base x p_base_part. An IMU's
     orientation is that of its own axes (REP 145), unless its accelerations contain gravity and show that the
     driver gives that of base.
-
-    Args:
-        role: The role of the columns.
-        columns: Columns of messages, one row each.
-        mount: Where the part is.
     """
     p, q = mount.p, mount.q_xyzw
     turned = 2 * np.linalg.norm(q[:3]) > TURNED_RAD
@@ -232,11 +198,7 @@ def _of_base(given: Array, turned: Array, a_base: Array) -> bool:
 
 
 def frames_of(leaves: Iterable[Leaf], messages: Messages) -> Frames:
-    """The frames of the messages of a topic, whose type has some leaves.
-
-    Raises:
-        InputError: They have several frames.
-    """
+    """The frames of the messages of a topic, whose type has some leaves; several are refused."""
     leaves = tuple(leaves)
     wanted = [leaf.name for leaf in leaves if leaf.name in LEAVES]
     names = decode(leaves, messages, wanted)

@@ -8,26 +8,15 @@ from magtwin.run.resample import linear, quaternion
 
 Array = NDArray[np.float64]
 
-GAP = 5.0
-"""Poses further apart than this multiple of their median interval are not interpolated between."""
-
-LEAST_GAP_S = 0.1
-"""Poses closer than this are always interpolated between [s]."""
-
-UNIT_WITHIN = 0.01
-"""Largest error of the length of a quaternion."""
+GAP = 5.0  # Poses further apart than this multiple of their median interval are not interpolated between
+LEAST_GAP_S = 0.1  # Poses closer than this are always interpolated between [s]
+UNIT_WITHIN = 0.01  # Largest error of the length of a quaternion
 
 
 def poses_at(t: Array, pose_t: Array, pose: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Interpolate poses; positions linearly, orientations by slerp.
+    """Interpolate poses (M, 7) at ascending times [s] (M,): positions linearly, orientations by slerp.
 
-    Args:
-        t: Times [s], shape (N,).
-        pose_t: Times of the poses, ascending [s], shape (M,).
-        pose: Positions and orientations xyzw, shape (M, 7).
-
-    Returns:
-        Positions (N, 3), orientations xyzw (N, 4), and whether each time lies between two poses (N,).
+    Returns positions (N, 3), orientations xyzw (N, 4), and whether each time lies between two poses (N,).
     """
     sound = sound_poses(pose)
     pose_t, pose = pose_t[sound], pose[sound]
@@ -50,11 +39,7 @@ def sound_poses(pose: Array) -> NDArray[np.bool_]:
 
 
 def check_poses(pose_t: Array, pose: Array, where: str, topic: str) -> None:
-    """Refuse poses of which less than two are sound; arguments as for `poses_at` and `field_nt`.
-
-    Raises:
-        InputError: So it is; the text says what is wrong with the first.
-    """
+    """Refuse poses of which less than two are sound, by what is wrong with the first."""
     bad = ~sound_poses(pose)
     if len(pose) < 2 or np.count_nonzero(~bad) >= 2:
         return

@@ -14,11 +14,8 @@ from magtwin.io.bags.topics import BATTERY, COMMAND, IMU, MAGNITUDE, ODOMETRY, P
 if TYPE_CHECKING:
     from magtwin.io.bags.bag import Bag
 
-LEAST = 2
-"""Messages from which a topic is a stream. One with fewer has a role only if there is no stream."""
-
-NUMBERS = ("f4", "f8")
-"""Kinds of leaves that can be a field."""
+LEAST = 2  # Messages from which a topic is a stream. One with fewer has a role only if there is no stream.
+NUMBERS = ("f4", "f8")  # Kinds of leaves that can be a field
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,32 +23,18 @@ class Role:
     """How the topic of a role is found. Words are beginnings of words in the name of a topic."""
 
     noun: str
-    kinds: tuple[str, ...] = ()
-    """Message types of this role alone."""
-
-    named: str = ""
-    """Words that make a topic of another readable type one of the role."""
-
-    never: str = ""
-    """Words of topics that are not of the role."""
+    kinds: tuple[str, ...] = ()  # Message types of this role alone
+    named: str = ""  # Words that make a topic of another readable type one of the role
+    never: str = ""  # Words of topics that are not of the role
 
     ranks: tuple[str, ...] = ()
     """Words by rank; topics with a word of an earlier rank go before. "*" is the rank of other topics."""
 
-    option: str = ""
-    """Option that chooses. Default: --remap."""
-
-    position: str = ""
-    """Column of the position of the child frame in the frame of the header, which does not move."""
-
-    orientation: str = ""
-    """Orientation of the child frame; without `position`, of the frame of the header in the world."""
-
-    twist: tuple[str, ...] = ()
-    """Linear and angular velocity in the child frame."""
-
-    vectors: tuple[str, ...] = ()
-    """Vectors in the frame of the header, which is a part of the robot."""
+    option: str = ""  # Option that chooses. Default: --remap.
+    position: str = ""  # Column of the position of the child frame in that of the header, which is still
+    orientation: str = ""  # Orientation of the child frame; without `position`, that of the header
+    twist: tuple[str, ...] = ()  # Linear and angular velocity in the child frame
+    vectors: tuple[str, ...] = ()  # Vectors in the frame of the header, which is a part of the robot
 
     def rank(self, name: str) -> int:
         """The rank of a topic by its name, 0 is best."""
@@ -117,15 +100,11 @@ ROLES: Mapping[Topic, Role] = {
 }
 """Topics that are read from a robot's recording."""
 
-VITAL = (MAGNITUDE, POSE, ODOMETRY, VECTOR)
-"""Roles of which a fault refuses the recording. Others are left out with a warning."""
+VITAL = (MAGNITUDE, POSE, ODOMETRY, VECTOR)  # A fault of others leaves them out with a warning
 
 
 def role_of(columns: Iterable[str]) -> Role | None:
-    """The role of messages of some columns; None if no column depends on a frame.
-
-    A magnitude and the times of scans, which is all that is read of them, have no axes.
-    """
+    """The role of messages of some columns; None if none has axes, as a magnitude or a scan's time."""
     moved = (role for role in ROLES.values() if role.position or role.vectors)
     return next((role for role in moved if {role.position or role.vectors[0]} & set(columns)), None)
 
@@ -210,21 +189,13 @@ def _best(leaves: list[str]) -> str | None:
 
 
 def check_roles(topics: Iterable[str]) -> None:
-    """Refuse topics that are not those of roles, by their names in `TOPICS`.
-
-    Raises:
-        InputError: So it is.
-    """
+    """Refuse topics that are not those of roles, by their names in `TOPICS`."""
     for name in topics:
         find("topic", name, {topic.name: topic for topic in ROLES})
 
 
 def check_kind(role: Topic, bag: "Bag", name: str) -> None:
-    """Refuse a topic that was chosen for a role and is missing or of another type.
-
-    Raises:
-        InputError: So it is.
-    """
+    """Refuse a topic that was chosen for a role and is missing or of another type."""
     if name not in bag.kinds:
         raise bag.missing(name)
     if not can_be(role, bag, name):

@@ -42,17 +42,10 @@ from magtwin.run.run import COLUMNS, Run
 Array = NDArray[np.float64]
 Columns = dict[str, NDArray[Any]]
 
-SCAN_S = 0.5
-"""Time after a scan during which a LiDAR counts as on [s]."""
-
-GRAVITY = 9.80665
-"""Standard gravity [m/s2]."""
-
-MOVED_M, MOVED_RAD = 0.001, 0.002
-"""Correction of odometry by transforms below which there is none [m], [rad]."""
-
-TRANSFORMS = "tf"
-"""Given in place of a topic of poses: the pose of the robot's base by /tf."""
+SCAN_S = 0.5  # Time after a scan during which a LiDAR counts as on [s]
+GRAVITY = 9.80665  # Standard gravity [m/s2]
+MOVED_M, MOVED_RAD = 0.001, 0.002  # Correction of odometry by transforms below which there is none [m], [rad]
+TRANSFORMS = "tf"  # Given in place of a topic of poses: the pose of the robot's base by /tf
 
 
 def read_recording(
@@ -197,8 +190,9 @@ class Recording:
             self.roles[ROLES[POSE].noun] = TF.name
             self._place(placed[0], f"topic {placed[1]}" if placed[0].name != TF.name else placed[1])
         elif self._by_tf:
+            known = ", ".join({*self.tree.moving, *self.tree.static.parents}) or "none"
             raise InputError(
-                f"{self._bag.path}: /tf does not move a base of the robot in a map; frames: {self._known()}"
+                f"{self._bag.path}: /tf does not move a base of the robot in a map; frames: {known}"
             )
         elif self._survey:
             if ODOMETRY not in self._topics:
@@ -358,9 +352,6 @@ class Recording:
             "taken as in the axes of base_link"
         )
 
-    def _known(self) -> str:
-        return ", ".join({*self.tree.moving, *self.tree.static.parents}) or "none"
-
     def _signal(self, topic: Topic) -> Signal:
         name = self._topics[topic]
         signal = read_signal(self._bag, name, topic, self._messages[name])
@@ -398,10 +389,7 @@ class Recording:
         return signal, when
 
     def _in_base(self, signal: Signal, columns: Columns) -> Columns:
-        """Columns of a signal as those of base_link.
-
-        Warns if its frame cannot be that of such a signal.
-        """
+        """Columns of a signal as those of base_link. Warns if its frame cannot be that of such a signal."""
         role, frames = role_of(columns), self._frames(signal)
         if role is None:
             return columns
@@ -417,14 +405,10 @@ class Recording:
             and frames[0]
             and kind_of(frames[0]) != "base"
             and not fault
-            and not self._at_base(frames[0])
+            and frames[0] not in self.tree.moving  # the base of a tree
         ):
             self._frameless.setdefault(frames[0], []).append(signal.name)
         return columns
-
-    def _at_base(self, frame: str) -> bool:
-        """Whether a frame is the base of a tree."""
-        return frame in self.tree.moving
 
     def _held(self, values: Columns, when: Array) -> Columns:
         """Columns of a signal, held causally at the times of readings."""

@@ -20,22 +20,13 @@ STAMPS = {"header.stamp": 1, "stamp": 1, "timestamp": 1000}
 class Signal(NamedTuple):
     """The decoded messages of a topic."""
 
-    name: str
-    """Name of the topic in the bag."""
-
+    name: str  # Name of the topic in the bag
     topic: Topic
-    kind: str
-    """Message type."""
-
+    kind: str  # Message type
     messages: Messages
-    fields: dict[str, Any]
-    """Values by leaf name."""
-
-    stamps: NDArray[np.int64] | None
-    """Stamps of the messages [ns], shape (M,). None: they have none."""
-
-    broken: int = 0
-    """How many messages were left out, as they end too early or have another encoding."""
+    fields: dict[str, Any]  # Values by leaf name
+    stamps: NDArray[np.int64] | None  # Stamps of the messages [ns], shape (M,). None: they have none.
+    broken: int = 0  # How many messages were left out, as they end too early or have another encoding
 
     @property
     def received(self) -> Index:
@@ -64,17 +55,7 @@ class Signal(NamedTuple):
 
 
 def read_signal(bag: Bag, name: str, topic: Topic, messages: Messages) -> Signal:
-    """The messages of a topic, decoded. A few that cannot be decoded are left out.
-
-    Args:
-        bag: The bag.
-        name: Name of the topic in the bag.
-        topic: Its role.
-        messages: Its messages.
-
-    Raises:
-        InputError: Its messages are not of its type.
-    """
+    """The messages of a topic of a bag, decoded for a role. A few that cannot be decoded are left out."""
     topic, leaves = reads_of(topic, bag, name), bag.layout(name)
     known = {leaf.name: leaf.kind for leaf in leaves}
     stamp = next((leaf for leaf in STAMPS if known.get(leaf) in ("time", "u8")), None)

@@ -9,39 +9,21 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.io.bags.cdr import NS, Index
 
-JUMP_S = 1.0
-"""Stamps further from those around them than this are wrong, or those of another clock [s]."""
-
-WRONG = 0.01
-"""Share of messages with wrong stamps up to which they are left out."""
-
-UNSET_NS = 10**7 * NS
-"""Median of stamps from which a stamp of 0 was not set, and is not the beginning of a simulation [ns]."""
-
-AROUND = 5
-"""Number of messages around one, itself included, from whose median an outlier is told."""
+JUMP_S = 1.0  # Stamps further from those around them than this are wrong, or those of another clock [s]
+WRONG = 0.01  # Share of messages with wrong stamps up to which they are left out
+UNSET_NS = 10**7 * NS  # Median of stamps from which one of 0 was not set, and begins no simulation [ns]
+AROUND = 5  # Number of messages around one, itself included, from whose median an outlier is told
 
 
 class Order(NamedTuple):
     """The messages of a topic in the order of their times."""
 
-    rows: NDArray[np.intp]
-    """Which messages are kept, in order."""
-
-    ns: Index
-    """Their times, ascending [ns]."""
-
-    sorted: int = 0
-    """How many came after a later one."""
-
-    unset: int = 0
-    """How many were left out, as their stamp is 0."""
-
-    outliers: int = 0
-    """How many were left out, as their stamp is far from those around it."""
-
-    repeated: int = 0
-    """How many have the time of the one before."""
+    rows: NDArray[np.intp]  # Which messages are kept, in order
+    ns: Index  # Their times, ascending [ns]
+    sorted: int = 0  # How many came after a later one
+    unset: int = 0  # How many were left out, as their stamp is 0
+    outliers: int = 0  # How many were left out, as their stamp is far from those around it
+    repeated: int = 0  # How many have the time of the one before
 
     def __str__(self) -> str:
         """What was done, in words; "" if nothing was."""
@@ -52,19 +34,10 @@ class Order(NamedTuple):
 
 
 def in_order(ns: Index, received: Index, where: Path, topic: str) -> Order:
-    """Messages in the order of their times.
+    """Messages, given in the order of receipt, in the order of their times [ns], shape (M,).
 
     Messages that overtook each other are sorted. A few whose stamp is 0, or more than `JUMP_S` from those
-    around it, are left out.
-
-    Args:
-        ns: Times of the messages, in the order of receipt [ns], shape (M,).
-        received: Times of receipt [ns], shape (M,).
-        where: The bag, for refusals.
-        topic: The topic, for refusals.
-
-    Raises:
-        InputError: The clock of the stamps jumps for good, or too many stamps are wrong.
+    around it, are left out. Refused is a clock that jumps for good, or is wrong too often.
     """
     everyone = np.arange(len(ns))
     steps = np.diff(ns)

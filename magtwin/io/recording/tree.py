@@ -16,11 +16,8 @@ from magtwin.io.recording.poses import poses_at
 
 Array = NDArray[np.float64]
 
-STILL = 1e-9
-"""Largest change of a transform on /tf that does not move [m] and parts of a quaternion."""
-
-MOST_DESCRIPTION = 4_000_000
-"""Longest description that is read [characters]."""
+STILL = 1e-9  # Largest change of a transform on /tf that does not move [m] and parts of a quaternion
+MOST_DESCRIPTION = 4_000_000  # Longest description that is read [characters]
 
 
 class Tree:
@@ -75,14 +72,10 @@ class Tree:
         return self.moving[frame][0] if frame in self.moving else self.static.parents.get(frame, ("",))[0]
 
     def at(self, frame: str, ns: Index) -> tuple[Array, Array]:
-        """Origin [m] and axes (xyzw) of a frame in the root of its tree, shape (M, 3) and (M, 4).
+        """Origin [m] and axes (xyzw) of a frame in the root of its tree at times [ns], shapes (M, 3), (M, 4).
 
         p_root = p + rotate(q, p_child) and q_root = q q_child for each edge upwards. Between transforms it is
         interpolated, and beyond them the nearest one counts.
-
-        Args:
-            frame: The frame.
-            ns: Times [ns], shape (M,).
         """
         p, q = np.zeros((len(ns), 3)), np.tile(IDENTITY_XYZW, (len(ns), 1)).astype(float)
         for name in self.up(frame)[:-1]:
@@ -100,18 +93,14 @@ class Tree:
     def base(self, near: str = "") -> str:
         """The robot's base, whose pose moves in a frame that stands still; "" if there is none.
 
-        Args:
-            near: A frame on the robot, which decides between several robots.
-
-        Raises:
-            InputError: There are several robots.
+        A frame `near` on the robot decides between several robots, which are refused else.
         """
         names = {*self.moving, *self.static.parents}
-        found = [name for name in names if kind_of(name) == "base" and self._moves(name)]
+        ways = {name: self.up(name) for name in names if kind_of(name) == "base"}
+        found = [n for n, way in ways.items() if kind_of(way[-1]) == "fixed" and {*way} & self.moving.keys()]
         if near:
-            found = [
-                name for name in found if set(self.up(near)) & set(self.up(name)) & {*self.moving}
-            ] or found
+            above = {*self.up(near)} & self.moving.keys()
+            found = [name for name in found if above & {*ways[name]}] or found
         for rank in ("base_link", "base_footprint", ""):
             if best := sorted(name for name in found if name.endswith(rank)):
                 if len(best) > 1 and rank:
@@ -120,10 +109,6 @@ class Tree:
                     )
                 return best[0]
         return ""
-
-    def _moves(self, name: str) -> bool:
-        way = self.up(name)
-        return kind_of(way[-1]) == "fixed" and any(each in self.moving for each in way)
 
     def stamps(self, frame: str) -> Index:
         """Times of the transforms of the edge above a frame that has most [ns]."""

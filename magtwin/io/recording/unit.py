@@ -11,24 +11,16 @@ from magtwin.field.units import INDOORS_NT, LEAST_USUAL_NT, MOST_USUAL_NT, NT_PE
 
 Array = NDArray[np.float64]
 
-IRON = 2.0
-"""Factor by which iron near the sensor may change the median of the field."""
+IRON = 2.0  # Factor by which iron near the sensor may change the median of the field
 
 
 class Field(NamedTuple):
     """A magnetic field in nT."""
 
-    b_nt: Array
-    """Magnitude [nT], shape (N,); nan for a message of 0, which is no field."""
-
-    vector_nt: Array | None
-    """Vector [nT], shape (N, 3). None: the messages hold a magnitude."""
-
-    label: str
-    """Unit of the messages."""
-
-    left_out: str
-    """How many messages are 0; "" if none are."""
+    b_nt: Array  # Magnitude [nT], shape (N,); nan for a message of 0, which is no field
+    vector_nt: Array | None  # Vector [nT], shape (N, 3). None: the messages hold a magnitude.
+    label: str  # Unit of the messages
+    left_out: str  # How many messages are 0; "" if none are
 
 
 def field_nt(
@@ -40,24 +32,13 @@ def field_nt(
     scale: float | None = None,
     standard: bool = True,
 ) -> Field:
-    """The field of messages in nT.
+    """The field of messages in nT, of magnitudes `b`, shape (N,), or vectors, shape (N, 3).
 
-    A unit or scale that is given counts, with a warning if the median is not that of the Earth's field. A
-    guess warns, unless it is the tesla of messages of a standard type. By a guess, a median up to twice too
-    large or too small is taken: it may be that of iron near the sensor.
-
-    Args:
-        b: Magnitudes, shape (N,), or vectors, shape (N, 3). Vectors whose y and z are all 0 are magnitudes in
-            x, as APRILab's robot publishes them.
-        where: The file, for refusals.
-        topic: The topic, for refusals.
-        unit: Their unit. Default: the unit that makes their median the Earth's field.
-        scale: Factor to nT, in place of a unit.
-        standard: Whether their type is one of ROS whose unit is T.
-
-    Raises:
-        InputError: No unit was given and none makes the median that of the Earth's field, or no message holds
-            a number.
+    Vectors whose y and z are all 0 are magnitudes in x, as APRILab's robot publishes them. A unit or a
+    `scale` to nT that is given counts, with a warning if the median is not that of the Earth's field. Else
+    the unit is the one that makes it so, up to twice too large or too small, as by iron near the sensor; this
+    warns, unless it is the tesla of messages of a `standard` type of ROS. It is refused if no unit does, or
+    no message holds a number; `where` is the file and `topic` the topic, for that.
     """
     vector = b if b.ndim == 2 and np.any(b[:, 1:] != 0) else None
     size = np.abs(b if b.ndim == 1 else b[:, 0]) if vector is None else np.linalg.norm(b, axis=1)
@@ -88,10 +69,7 @@ def field_nt(
 
 
 def unit_of(usual: float, where: str, topic: str) -> Unit:
-    """The unit in which a median magnitude is the Earth's field, or at least the Earth's with that of iron.
-
-    The ranges of the units do not overlap.
-    """
+    """The unit that makes a median magnitude the Earth's field, else that with iron; they do not overlap."""
     for apart in (1.0, IRON):
         for unit, factor in NT_PER.items():
             if _is_earths(usual * factor, apart):

@@ -11,7 +11,6 @@ import numpy as np
 from rerun.chunk import RrdReader
 
 from magtwin.errors import InputError
-from magtwin.files.budget import check_size
 from magtwin.files.file import existing
 from magtwin.files.outputs import output
 from magtwin.io.rerun.layout import RUN_COLOURS, Shown, comparison_layout, plotted
@@ -94,19 +93,7 @@ def write_comparison(
     planned: Path | None = None,
     force: bool = False,
 ) -> None:
-    """Write several runs into one recording, on a common timeline, each in its own colour.
-
-    Args:
-        runs: The runs by name.
-        path: The .rrd file to make.
-        twin: Where they took place. None: only series.
-        planned: The planned path, or None.
-        force: Whether to replace an existing file.
-
-    Raises:
-        InputError: There is no run or one has no rows, two names are the same to Rerun, or the file cannot be
-            made as in `write_rrd`.
-    """
+    """Write several runs by name into one recording, on a common timeline, each in its own colour."""
     if not runs:
         raise InputError(f"{path}: there are no runs to compare; name at least one")
     for run in runs.values():
@@ -142,13 +129,7 @@ def write_comparison(
 def show_run(run: Run, twin: Twin | None = None, *, file: str | os.PathLike[str]) -> None:
     """Show a run in the Rerun viewer; returns when the viewer is closed.
 
-    Args:
-        run: The run.
-        twin: Where it took place. None: only series.
-        file: The file that the run was read from; errors and the window name it.
-
-    Raises:
-        InputError: The run has no rows or, without a twin, nothing to plot; or the viewer cannot run here.
+    Without the twin, only series are shown. Errors and the window name `file`, from which the run was read.
     """
     _check_rows(run, file)
     if twin is None and not plotted(run):
@@ -160,14 +141,7 @@ def show_run(run: Run, twin: Twin | None = None, *, file: str | os.PathLike[str]
 
 
 def read_run(path: str | os.PathLike[str]) -> Run:
-    """The run of a recording, equal to the written one to the bit.
-
-    Args:
-        path: The .rrd file.
-
-    Raises:
-        InputError: The file is missing, is not a recording, was cut short, or holds no run or several.
-    """
+    """The run of a recording, equal to the written one to the bit; refused if it holds none, or several."""
     runs = read_runs(path)
     if len(runs) > 1:
         raise InputError(
@@ -178,22 +152,12 @@ def read_run(path: str | os.PathLike[str]) -> Run:
 
 
 def read_runs(path: str | os.PathLike[str]) -> dict[str, Run]:
-    """The runs of a recording by name; a single run is called "run".
-
-    Args:
-        path: The .rrd file.
-
-    Raises:
-        InputError: As for `read_run`.
-    """
+    """The runs of a recording by name; a single run is called "run"."""
     path = existing(path, "recording")
-    if path.is_dir():
-        raise InputError(f"{path}: a folder; name the .rrd file in it")
-    check_size(path, "rrd")
     chunks: dict[str, list] = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # one that was cut short has no end
-        check_decodes(path, path)
+        check_decodes(path)
         try:
             for chunk in RrdReader(path).stream().filter(content=f"/{COLUMNS_ENTITY}/**").to_chunks():
                 chunks.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())

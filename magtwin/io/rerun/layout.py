@@ -27,8 +27,7 @@ from magtwin.spec.lab import LabSpec
 
 Array = NDArray[np.float64]
 
-_ROOM = 0.08
-"""Room beyond the values and the ticks of an axis, as a share of the range of the values."""
+_ROOM = 0.08  # Room beyond the values and the ticks of an axis, as a share of the range of the values
 
 Colour = tuple[int, int, int]
 
@@ -46,11 +45,8 @@ class Series:
     column: str
     name: str
     colour: Colour
-    part: str = ""
-    """Name of the part, such as x, of a vector column."""
-
-    width: float = 1.5
-    """Width of the line [points]. Wide lines are drawn below narrow ones."""
+    part: str = ""  # Name of the part, such as x, of a vector column
+    width: float = 1.5  # Width of the line [points]. Wide lines are drawn below narrow ones.
 
 
 _BLUE, _ORANGE, _GREEN, _GREY = (86, 156, 255), (255, 158, 64), (92, 200, 120), (165, 165, 165)
@@ -58,8 +54,7 @@ _DIM = (118, 106, 150)
 _NAMES = {_BLUE: "blue", _ORANGE: "orange", _GREEN: "green", _GREY: "grey", _DIM: "violet"}
 """Names of colours, which the title of a plot gives with its lines, in place of a legend over them."""
 
-_SPIKES = 0.005
-"""Share of the largest and of the smallest values of an error that its axis may leave out."""
+_SPIKES = 0.005  # Share of the largest and of the smallest values of an error that its axis may leave out
 
 PLOTS: Mapping[str, Mapping[str, tuple[Series, ...]]] = {
     "": {
@@ -122,12 +117,8 @@ _COMPARED = (
 class Shown:
     """A run whose series are plotted."""
 
-    run: Run
-    """Its columns, and those derived for the plots."""
-
-    name: str = ""
-    """Its name among several runs; "" for a single run."""
-
+    run: Run  # Its columns, and those derived for the plots
+    name: str = ""  # Its name among several runs; "" for a single run
     colour: Colour = _ORANGE
 
     @classmethod
@@ -161,14 +152,11 @@ def layout(
 ) -> rrb.Blueprint:
     """The views of a run: plots, states and events, and with a lab also the lab and the robot in 3D.
 
-    Args:
-        run: The run.
-        lab: The lab. None: no 3D views.
-        heading: Heading of the map on the floor [rad], for the title.
-        events: Flags that get a lane of states. Default: those that the run raised.
+    `heading` is that of the map on the floor [rad], for the title; `events` are flags that get a lane of
+    states, by default those that the run raised.
     """
     shown = Shown.of(run)
-    axis = _whole([shown])
+    axis = time_axis([run])
     stacks = {
         tab: _stacked(axis, {title: [(shown, line) for line in lines] for title, lines in plots.items()})
         for tab, plots in PLOTS.items()
@@ -195,15 +183,12 @@ def layout(
 def comparison_layout(
     runs: Sequence[Shown], lab: LabSpec | None = None, *, heading: float = 0.0
 ) -> rrb.Blueprint:
-    """The views of several runs on a common timeline, each in its own colour.
-
-    Without a lab there are no 3D views; `heading` is that of the map on the floor [rad], for the title.
-    """
+    """The views of several runs on a common timeline; `heading` is that of the map on the floor [rad]."""
     plots = {
         title: [(shown, Series(column, shown.name, shown.colour, part)) for shown in runs]
         for title, column, part in _COMPARED
     }
-    side = rrb.Vertical(*_stacked(_whole(runs), plots))
+    side = rrb.Vertical(*_stacked(time_axis([shown.run for shown in runs]), plots))
     metadata = [
         rrb.TextDocumentView(origin=entity_of("metadata", shown.name), name=shown.name) for shown in runs
     ]
@@ -239,6 +224,11 @@ def _blueprint(
         eye: dict[str, Any] = {"without": "world/robot/sensors", "position": position, "target": target}
         left = rrb.Vertical(_view_3d("world", title, names, **eye), lower, row_shares=[2.0, 1.0])
         root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
+    return bare(root)
+
+
+def bare(root: Any) -> rrb.Blueprint:
+    """Views without the viewer's panels."""
     return rrb.Blueprint(
         root,
         rrb.BlueprintPanel(state="collapsed"),
@@ -247,9 +237,9 @@ def _blueprint(
     )
 
 
-def _whole(runs: Sequence[Shown]) -> rrb.TimeAxis:
+def time_axis(runs: Sequence[Run]) -> rrb.TimeAxis:
     """The axis that covers all of the runs."""
-    ends = [shown.run["t"][[0, -1]] for shown in runs]
+    ends = [run["t"][[0, -1]] for run in runs]
     first, last = (rrb.TimeRangeBoundary.absolute(seconds=float(k(ends))) for k in (np.min, np.max))
     return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
 
@@ -306,10 +296,7 @@ def _titled(title: str, lines: Sequence[tuple[str, Colour]]) -> str:
 
 
 def value_range(values: Array) -> tuple[float, float] | None:
-    """Ends of an axis with room beyond the values and beyond every tick, so that no label is cut.
-
-    nan is ignored. None for values that do not vary, where the viewer's default is as good.
-    """
+    """Ends of an axis with room beyond the values and every tick; nan is ignored. None if all are alike."""
     known = values[np.isfinite(values)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     if high - low <= 1e-9 * max(abs(low), abs(high)):
@@ -323,10 +310,7 @@ def value_range(values: Array) -> tuple[float, float] | None:
 
 
 def lab_eye(lab: LabSpec) -> tuple[Vec3, Vec3]:
-    """Position and target of an eye that sees a whole lab, in world [m].
-
-    The eye is above the near edge of the floor, inside the capture frame, so that no rail crosses the floor.
-    """
+    """Position and target of an eye above the near edge of the floor that sees a whole lab, in world [m]."""
     x0, x1, y0, y1 = lab.extent_m
     x, y, at_x, at_y = x1 - x0, y1 - y0, (x0 + x1) / 2, (y0 + y1) / 2
     height = max(0.9 * max(x, 1.7 * y), 1.5 * lab.post_height_m)
@@ -342,7 +326,7 @@ def _floor_view(lab: LabSpec, names: Sequence[str]) -> rrb.Spatial2DView:
         name="Map from above [m]",
         background=(24, 26, 31),
         visual_bounds=rrb.VisualBounds2D(x_range=(x0 - more, x1 + more), y_range=(y0 - more, y1 + more)),
-        overrides={entity_of("floor/paths/driven", name): _UP_TO_NOW for name in names},
+        overrides={entity_of("floor/paths/driven", name): UP_TO_NOW for name in names},
     )
 
 
@@ -351,7 +335,7 @@ def _event_view() -> rrb.TextLogView:
     return rrb.TextLogView(origin="events", name="Events", columns=shown)
 
 
-_UP_TO_NOW = rrb.VisibleTimeRanges(
+UP_TO_NOW = rrb.VisibleTimeRanges(
     rrb.VisibleTimeRange(
         TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
     )
@@ -370,7 +354,7 @@ def _view_3d(
 ) -> rrb.Spatial3DView:
     """The world in the axes of `origin`, from a position [m]; readings appear with time."""
     ends = ("world/driven", "world/readings")
-    piling_up: dict[Any, Any] = {entity_of(end, name): _UP_TO_NOW for end in ends for name in names}
+    piling_up: dict[Any, Any] = {entity_of(end, name): UP_TO_NOW for end in ends for name in names}
     return rrb.Spatial3DView(
         origin=origin,
         contents=["/world/**", f"- /{without}/**"],

@@ -23,11 +23,8 @@ from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
 from magtwin.twin import Twin
 
-TICK_S = 0.05
-"""Time between blocks of a run that is shown in step with the clock [s]."""
-
-Show = Callable[[float, tuple[float, float, float]], None]
-"""Takes the time [s] and x [m], y [m], yaw [rad] of base_link."""
+TICK_S = 0.05  # Time between blocks of a run that is shown in step with the clock [s]
+Show = Callable[[float, tuple[float, float, float]], None]  # Takes t [s] and x, y [m], yaw [rad]
 
 
 def play(
@@ -42,17 +39,8 @@ def play(
 ) -> None:
     """Show a run in step with the clock, in the layout of `write_rrd`.
 
-    Args:
-        run: The run.
-        twin: Where it took place.
-        address: Address of a Rerun viewer, such as rerun+http://127.0.0.1:9876/proxy.
-        planned: The planned path.
-        scans: The LiDAR's scans.
-        pace: Simulated seconds per second.
-        progress: Called with seconds done, seconds in all and a word.
-
-    Raises:
-        InputError: No viewer listens there, or it was closed.
+    `address` is that of a Rerun viewer, such as rerun+http://127.0.0.1:9876/proxy; none there is refused.
+    `pace` is simulated seconds per second; `progress` is called with seconds done, seconds in all and a word.
     """
     check_listens(address)
     t, rate_hz = run["t"], (run.rows - 1) / run.duration_s if run.duration_s else 0.0
@@ -72,11 +60,7 @@ def play(
 
 
 def check_listens(address: str) -> None:
-    """Refuse an address at which no viewer listens: Rerun itself would wait for one.
-
-    Raises:
-        InputError: It is not an address of a viewer, or no viewer is there.
-    """
+    """Refuse an address at which no viewer listens: Rerun itself would wait for one."""
     parts = urlsplit(address)
     try:
         if not parts.scheme.startswith("rerun") or not parts.hostname or not parts.port:
@@ -88,11 +72,7 @@ def check_listens(address: str) -> None:
 
 @contextmanager
 def live_view(twin: Twin) -> Iterator[Show]:
-    """The lab and the robot in a window, which is closed with the block.
-
-    Raises:
-        InputError: No window can be opened here.
-    """
+    """The lab and the robot in a window, which is closed with the block."""
     with live_viewer() as (address, _), streamed(twin, address) as show:
         yield show
 

@@ -13,7 +13,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files.outputs import output
 from magtwin.frames import wrap_angle
-from magtwin.io.rerun.layout import value_range
+from magtwin.io.rerun.layout import UP_TO_NOW, bare, time_axis, value_range
 from magtwin.io.rerun.recording import ROOM, Recording, content_id, size_of, stream, title_of
 from magtwin.io.rerun.series import TIMELINE, Array, nanoseconds, send
 from magtwin.io.rerun.world import Scale, heading_of, send_map
@@ -22,11 +22,8 @@ from magtwin.run.run import Run
 
 FLOOR, PATHS = "floor", "floor/paths"
 
-MOST_PARTICLES = 300
-"""Particles drawn at a time, each of the same weight."""
-
-ARROW_M = 0.25
-"""Length of the arrows that show the headings [m]."""
+MOST_PARTICLES = 300  # Particles drawn at a time, each of the same weight
+ARROW_M = 0.25  # Length of the arrows that show the headings [m]
 
 TRUTH, ESTIMATE, DEAD, BOUND, BAND = (
     *((235, 235, 235), (255, 130, 50), (86, 156, 255), (92, 200, 120)),
@@ -49,21 +46,10 @@ def write_localization(
 ) -> None:
     """Write a localized run as a recording: the map from above with the poses, and errors against time.
 
-    The columns of the run are stored as by `magtwin.io.rerun.file.write_rrd`, and can be read back.
-
-    Args:
-        run: A run with the columns of `magtwin.localization.track.EST_COLUMNS`.
-        path: The .rrd file to make.
-        anomaly_map: The map, drawn below the paths.
-        truth: True x, y [m] and yaw [rad], shape (N, 3).
-        dead_reckoning: The same by dead reckoning.
-        bound_m: Least standard deviation of the position [m], shape (N,).
-        particles: Samples at each reading, shapes (P, 4): x, y, yaw, weight; () to draw ellipses instead.
-        force: Whether to replace an existing file.
-
-    Raises:
-        InputError: The run has no rows or no estimates; or the file exists and `force` was not given, or it
-            cannot be written.
+    The columns of the run, which has those of `magtwin.localization.track.EST_COLUMNS`, are stored as by
+    `magtwin.io.rerun.file.write_rrd`, and can be read back. `truth` and `dead_reckoning` are x, y [m] and yaw
+    [rad], shape (N, 3); `bound_m` is the least standard deviation of the position [m], shape (N,);
+    `particles` are samples at each reading, shapes (P, 4): x, y, yaw, weight, or () to draw ellipses.
     """
     if not run.rows or "est_p_world_base" not in run:
         raise InputError(f"{path}: the run has no estimates to record; run `magtwin localize` on it first")
@@ -134,8 +120,7 @@ def _series(
 def _layout(
     run: Run, series: dict[str, dict[str, Line]], field: AnomalyMap | None, truth: Array | None
 ) -> rrb.Blueprint:
-    first, last = (rrb.TimeRangeBoundary.absolute(seconds=float(run["t"][k])) for k in (0, -1))
-    axis = rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
+    axis = time_axis([run])
     views = []
     for title, lines in series.items():
         values = np.concatenate([line[3] for line in lines.values()])
@@ -161,23 +146,12 @@ def _layout(
         name="Map, true pose (white), estimate (orange), dead reckoning (blue)",
         background=(24, 26, 31),
         visual_bounds=rrb.VisualBounds2D(x_range=(x0 - room, x1 + room), y_range=(-y1 - room, -y0 + room)),
-        overrides={f"{PATHS}/estimate": _so_far()},
+        overrides={f"{PATHS}/estimate": UP_TO_NOW},
     )
     page = rrb.TextDocumentView(origin="metadata", name="Run")
     left = rrb.Vertical(floor, page, row_shares=[4.0, 1.0])
     shares = [2.0, *[1.0] * (len(views) - 1)]
-    return rrb.Blueprint(
-        rrb.Horizontal(left, rrb.Vertical(*views, row_shares=shares), column_shares=[3.0, 2.0]),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
-    )
-
-
-def _so_far() -> rrb.VisibleTimeRanges:
-    """All of an entity up to the time shown."""
-    start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
-    return rrb.VisibleTimeRanges(rrb.VisibleTimeRange(TIMELINE, start=start, end=end))
+    return bare(rrb.Horizontal(left, rrb.Vertical(*views, row_shares=shares), column_shares=[3.0, 2.0]))
 
 
 def _send_floor(rec: rr.RecordingStream, run: Run, field: AnomalyMap | None) -> None:

@@ -37,35 +37,19 @@ from magtwin.twin import Twin
 
 APPLICATION = "magtwin"
 
-PATIENCE_S = 60.0
-"""Time that Rerun may take to write its data [s]."""
-
-NEVER = timedelta(days=1)
-"""Time after which Rerun writes what it has, however little."""
-
-END = b"RRF2FOOT"
-"""Bytes at the end of a complete file."""
-
-ROOM = 1 << 20
-"""Upper bound of the bytes of a layout, the metadata and the column names."""
-
-_stuck = threading.Event()
-"""Set once Rerun waits for ever, for a thread that a full disk has ended."""
-
-POSED = frozenset(("p_world_base", "q_world_base_xyzw"))
-"""Columns that place a robot."""
+PATIENCE_S = 60.0  # Time that Rerun may take to write its data [s]
+NEVER = timedelta(days=1)  # Time after which Rerun writes what it has, however little
+END = b"RRF2FOOT"  # Bytes at the end of a complete file
+ROOM = 1 << 20  # Upper bound of the bytes of a layout, the metadata and the column names
+_stuck = threading.Event()  # Set once Rerun waits for ever, for a thread that a full disk has ended
+POSED = frozenset(("p_world_base", "q_world_base_xyzw"))  # Columns that place a robot
 
 
 def check_room(file: FilePath, size: int, final: FilePath | None = None) -> None:
-    """Refuse a recording for which the disk has no room.
+    """Refuse a recording of up to `size` bytes for which the disk has no room; errors name `final`.
 
-    Rerun writes from its own thread, and waits for that thread for ever after a full disk ended it. So the
-    room is checked first.
-
-    `size` is an upper bound of the file's size [bytes]; errors name `final`.
-
-    Raises:
-        InputError: There is no room, or its folder cannot be written.
+    Rerun writes from its own thread, and waits for it for ever after a full disk ended it. So this comes
+    first.
     """
     try:
         with tempfile.TemporaryFile(dir=file.parent) as probe:
@@ -106,9 +90,6 @@ def stream(
     The viewer merges recordings of one `recording_id`. `views` is the layout that it opens with, `final` the
     file that errors name, and `room` an upper bound of the file's size [bytes]. The file can be read at any
     time up to the last flush.
-
-    Raises:
-        InputError: Rerun is switched off, or the file cannot be written.
     """
     final = final or file
     if file is not None:
@@ -156,11 +137,7 @@ def _open(rec: rr.RecordingStream, sink: Any, views: rrb.Blueprint) -> None:
 
 
 def flush(rec: rr.RecordingStream, folder: FilePath | None) -> None:
-    """Wait until the data of a stream is written.
-
-    Raises:
-        RuntimeError: It cannot be written.
-    """
+    """Wait until the data of a stream is written; RuntimeError if it cannot be."""
     await_rerun(lambda: rec.flush(timeout_sec=PATIENCE_S), folder)
 
 
@@ -168,10 +145,7 @@ def await_rerun(work: Callable[[], object], folder: FilePath | None) -> None:
     """Call a function of Rerun that waits for its writing thread, which a full disk has ended.
 
     Rerun then waits for ever. So it works in a thread, while this one looks whether the disk of `folder` is
-    full. No folder: it is called as it is.
-
-    Raises:
-        RuntimeError: It fails, or has not ended after `PATIENCE_S`.
+    full. It is a RuntimeError if it fails, or has not ended after `PATIENCE_S`.
     """
     if folder is None:
         work()
@@ -209,14 +183,9 @@ class Recording:
     """One run in a stream. Append its rows, once or as they come, then close it."""
 
     rec: rr.RecordingStream
-    name: str = ""
-    """Its name among several runs; "" for a single run."""
-
-    robot: Robot | None = None
-    """Its robot in the room. None: only series."""
-
-    scans: Scans | None = None
-    """Its LiDAR scans, drawn if there is a robot."""
+    name: str = ""  # Its name among several runs; "" for a single run
+    robot: Robot | None = None  # Its robot in the room. None: only series.
+    scans: Scans | None = None  # Its LiDAR scans, drawn if there is a robot
 
     _rows: int = 0
     _last: Run | None = None
@@ -279,9 +248,6 @@ def recording_of(
     `known` sets axes and colours; default: `run`. No twin: only series. `room` is an upper bound of the size
     of the rows [bytes]; a `rate_hz` of 0 is taken from the first rows; `sinks` are `file`, `address` and
     `final` of `stream`.
-
-    Raises:
-        InputError: The stage cannot be read, or as for `stream`.
     """
     known = run if known is None else known
     lab, heading = (None, 0.0) if twin is None else (twin.scene.lab, heading_of(twin.field, known))

@@ -25,22 +25,19 @@ from magtwin.run.run import COLUMNS, Run, check_numbers
 
 Array = NDArray[np.float64]
 
-TIMELINE = "sim_time"
-"""Name of the timeline of a recording."""
+TIMELINE = "sim_time"  # Name of the timeline of a recording
 
 BLOCK = 4096
 """Rows per chunk: few enough for the viewer to skip what it does not show, and for LZ4, with its window of
 64 kB, to compress the repeated offsets of the lists."""
 
-COLUMNS_ENTITY, DERIVED_ENTITY = "run", "derived"
-"""Entities of the columns of a run, and of further lines of the plots."""
+COLUMNS_ENTITY, DERIVED_ENTITY = "run", "derived"  # Entities of columns, and of other lines
 
 FACTS, NAMES, NAME, ROWS = "magtwin_facts", "magtwin_columns", "magtwin_name", "magtwin_rows"
 """Components without time: metadata and columns as JSON, the name of the run among several, and the number of
 rows of a complete run."""
 
-GAP_S = 0.5
-"""Time that a flag must be down for its event to be over [s]."""
+GAP_S = 0.5  # Time that a flag must be down for its event to be over [s]
 
 
 @dataclass(frozen=True)
@@ -50,12 +47,9 @@ class State:
     name: str
     down: str
     up: str
-    begins: str
-    """Text of the event when the flag is raised."""
-
+    begins: str  # Text of the event when the flag is raised
     ends: str
-    level: str = "WARN"
-    """Level in Rerun's log."""
+    level: str = "WARN"  # Level in Rerun's log
 
 
 STATES: Mapping[str, State] = MappingProxyType(
@@ -87,8 +81,7 @@ DERIVED = (
 )
 """Lines of the plots that are not columns: see `derived`."""
 
-ERRORS = ("error_nt", *DERIVED[-4:])
-"""Lines whose axis leaves out rare spikes."""
+ERRORS = ("error_nt", *DERIVED[-4:])  # Lines whose axis leaves out rare spikes
 
 
 def derived(run: Run) -> dict[str, Array]:
@@ -127,10 +120,7 @@ def derived(run: Run) -> dict[str, Array]:
 
 
 def entity_of(entity: str, name: str) -> str:
-    """The entity of one run among several, by its name; `entity` itself for a single run.
-
-    Characters other than letters, digits, _ and - would need an escape in an entity path; they become _.
-    """
+    """The entity of one of several runs, by its name with _ for signs; `entity` for a single run."""
     plain = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in name)
     return f"{entity}/{plain}" if plain else entity
 
@@ -197,13 +187,7 @@ def _arrow(name: str, values: NDArray[Any], parts: tuple[str, ...]) -> pa.Array:
 
 
 def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | None]:
-    """The run in the chunks of its entity: its name, the run, and its number of rows if it is complete.
-
-    `chunks` are all chunks of the entity, in any order; `what` names the file in errors.
-
-    Raises:
-        InputError: The chunks hold no run.
-    """
+    """The run in all chunks of its entity: its name, the run, and its number of rows if it is complete."""
     static: dict[str, Any] = {}
     tables = []
     for batch in chunks:

@@ -31,23 +31,12 @@ from magtwin.parallel.machine import end_group, ends_with_parent
 
 LOCALHOST = "127.0.0.1"
 
-MAGIC = b"RRF"
-"""First bytes of a recording, before its format number."""
-
-HEADER, ARROW = 12, 2
-"""Bytes of a recording before its first message, and the kind of messages that hold chunks."""
-
-LEAST_SIZE, MOST_SIZE = 200, 8000
-"""Least and greatest side of a picture: room for the views, and the limit of a texture [pixels]."""
-
-PATIENCE_S = 600.0
-"""Time that a viewer that lives may take for a step, on a busy machine without a graphics card [s]."""
-
-LATE_S = 5.0
-"""Time after which an answer that did not come is late: Rerun's client waits for each for 15 s [s]."""
-
-FRAMES = 20
-"""Frames after which a loaded file has shown something, and after which the viewer's notices are gone."""
+MAGIC = b"RRF"  # First bytes of a recording, before its format number
+HEADER, ARROW = 12, 2  # Bytes before the first message, and the kind of messages that hold chunks
+LEAST_SIZE, MOST_SIZE = 200, 8000  # Sides of a picture: room for the views, limit of a texture [pixels]
+PATIENCE_S = 600.0  # Time that a living viewer may take for a step, without a graphics card [s]
+LATE_S = 5.0  # Time after which no answer is a late one: Rerun's client waits for 15 s [s]
+FRAMES = 20  # Frames after which a loaded file shows something, and notices are gone
 
 CANNOT_DRAW = re.compile(r"render context|adapter|graphics|wgpu|surface", re.IGNORECASE)
 """Words of a viewer that ended because it cannot draw."""
@@ -55,22 +44,14 @@ CANNOT_DRAW = re.compile(r"render context|adapter|graphics|wgpu|surface", re.IGN
 VULKAN = "without a graphics card it needs Vulkan in software: apt install mesa-vulkan-drivers libvulkan1"
 """What to do then."""
 
-TITLE_BAR = 36
-"""Height of the viewer's empty title bar [pixels]."""
-
-TOASTS_S, NOTHING_S = 6.0, 10.0
-"""Time until the viewer's own notices have disappeared, and until a loaded file shows something [s]."""
+TITLE_BAR = 36  # Height of the viewer's empty title bar [pixels]
+TOASTS_S, NOTHING_S = 6.0, 10.0  # Times until the viewer's notices are gone, and a file shows something [s]
 
 
 def show(rrd: str | os.PathLike[str], *, source: str | os.PathLike[str] | None = None) -> None:
     """Show a recording in a window; returns when the window is closed.
 
-    Args:
-        rrd: The recording.
-        source: The file that errors name, if `rrd` is a temporary recording of it. Default: `rrd`.
-
-    Raises:
-        InputError: The file is missing, or the viewer cannot run here.
+    Errors name `source`, if `rrd` is a temporary recording of it. They tell why the viewer cannot run here.
     """
     rrd = existing(rrd, "recording")
     command = [_binary(), "--bind", LOCALHOST, "--port", "auto", str(rrd)]
@@ -95,28 +76,15 @@ def screenshot(
 ) -> list[str]:
     """Draw a recording as the viewer shows it, with or without a display.
 
-    Args:
-        rrd: The recording.
-        png: The picture to make.
-        time_s: Time on the timeline `sim_time` [s]. Default: where the viewer starts.
-        size: Width and height of the picture [pixels].
-        force: Whether to replace an existing picture.
-
-    Returns:
-        The warnings and errors of the recording's views, one line each; empty if there are none.
-
-    Raises:
-        InputError: The recording is missing, cannot be read or has no such moment; the size is out of
-            range; the picture exists; or the machine has no Vulkan.
+    `time_s` is on the timeline `sim_time` [s], by default where the viewer starts; `size` is that of the
+    picture [pixels]. Returns the warnings and errors of the recording's views, one line each. Refused are a
+    recording that cannot be read or has no such moment, a size out of range, and a machine without Vulkan.
     """
     path = existing(rrd, "recording")
-    if path.is_dir():
-        raise InputError(f"{rrd}: a folder; name the .rrd file in it")
     if not (min(size) >= LEAST_SIZE and max(size) <= MOST_SIZE):
         limits = f"{LEAST_SIZE}..{MOST_SIZE} pixels each way"
         raise InputError(f"size of a recording's picture must lie in {limits}, got {size[0]} x {size[1]}")
-    check_size(path, "rrd")
-    check_decodes(path, rrd)
+    check_decodes(path)
     window = (size[0], size[1] + TITLE_BAR)
     with output(png, force=force) as aside, live_viewer(headless=True, size=window) as (_, client):
         views = _draw(client, path.resolve(), rrd, aside, time_s)
@@ -163,17 +131,10 @@ def _draw(
 def live_viewer(
     *, headless: bool = False, size: tuple[int, int] = (1600, 1000)
 ) -> Iterator[tuple[str, ViewerClient]]:
-    """A viewer that listens on localhost only; ended with the block.
+    """A viewer that listens on localhost only, ended with the block: its address, and a client.
 
-    Args:
-        headless: Whether it has no window, and only draws pictures.
-        size: Width and height of these pictures [pixels].
-
-    Yields:
-        The address that recordings connect to, and a client.
-
-    Raises:
-        InputError: It cannot run here; the text has its reason.
+    A `headless` one has no window, and only draws pictures of a size [pixels]. If it cannot run here, the
+    error tells its reason.
     """
     with socket.socket() as probe:
         probe.bind((LOCALHOST, 0))
@@ -245,10 +206,7 @@ def _interrupt_later() -> Iterator[list[int]]:
 def _connected(
     process: "subprocess.Popen[bytes]", port: int, log: IO[str], interrupts: list[int], *, draws: bool
 ) -> ViewerClient | None:
-    """A client of a started viewer, once it answers, or has drawn. It answers before it tries to draw.
-
-    None if the user interrupted.
-    """
+    """A client of a started viewer, once it answers, or has drawn; None if the user interrupted."""
     clients: list[ViewerClient] = []
 
     def ready() -> bool:
@@ -286,36 +244,32 @@ def _ending(process: "subprocess.Popen[bytes]", log: IO[str]) -> InputError:
     return InputError(f"the Rerun viewer ended: {reason}")
 
 
-def check_decodes(rrd: Path, source: str | os.PathLike[str]) -> None:
+def check_decodes(rrd: Path) -> None:
     """Refuse a recording that Rerun's own verifier cannot decode.
 
     The verifier is a separate process, as changed bytes may make Rerun's decoder end its process. A missing
-    end is accepted: a recording that still grows has none. Errors name `source`.
-
-    Raises:
-        InputError: It is not a recording, was cut short, or its bytes were changed.
+    end is accepted: a recording that still grows has none.
     """
+    if rrd.is_dir():
+        raise InputError(f"{rrd}: a folder; name the .rrd file in it")
+    check_size(rrd, "rrd")
+    no_recording = f"{rrd}: not a Rerun recording that can be read"
     with rrd.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
-            raise InputError(
-                f"{source}: not a Rerun recording that can be read (it does not start with RRF); "
-                "write it again"
-            )
-        _check_decoded(rrd, file, source)
+            raise InputError(f"{no_recording} (it does not start with RRF); write it again")
+        _check_decoded(rrd, file)
     command = [_binary(), "rrd", "verify", str(rrd)]
     patience = BUDGETS["rrd"].seconds + rrd.stat().st_size / 1e6
     done = run(command, limit_s=patience)
     if done.returncode == LATE:
-        raise InputError(f"{source}: Rerun does not decode it in {patience:.0f} s; write it again")
+        raise InputError(f"{rrd}: Rerun does not decode it in {patience:.0f} s; write it again")
     lines = [line for line in done.stderr.splitlines() if "Missing RRD footer" not in line and line.strip()]
     endless = done.returncode == 1 and [line.rpartition(" with ")[2] for line in lines] == ["1 errors"]
     if done.returncode and not endless:
-        raise InputError(
-            f"{source}: not a Rerun recording that can be read ({_reason(done.stderr)}); write it again"
-        )
+        raise InputError(f"{no_recording} ({_reason(done.stderr)}); write it again")
 
 
-def _check_decoded(rrd: Path, file: BinaryIO, source: str | os.PathLike[str]) -> None:
+def _check_decoded(rrd: Path, file: BinaryIO) -> None:
     """Refuse a recording whose messages, decompressed, are over the budget, by the sizes that they state.
 
     A message is kind, length and content; that of a chunk is protobuf (`ArrowMsg` of Rerun's
@@ -327,16 +281,12 @@ def _check_decoded(rrd: Path, file: BinaryIO, source: str | os.PathLike[str]) ->
         kind, length = struct.unpack("<QQ", file.read(16))
         if kind == ARROW:
             try:
-                decoded += _stated_size(file.read(min(length, size)))
+                message = file.read(min(length, size))
+                decoded += max((value for field, value, _, _ in fields(message) if field == 3), default=0)
             except ValueError as error:
-                raise InputError(f"{source}: damaged recording ({error}); write it again") from error
-            check_decoded(source, size, decoded)
+                raise InputError(f"{rrd}: damaged recording ({error}); write it again") from error
+            check_decoded(rrd, size, decoded)
         at += 16 + length
-
-
-def _stated_size(message: bytes) -> int:
-    """The uncompressed size of a chunk, by its message; 0 if it states none."""
-    return max((value for field, value, _, _ in fields(message) if field == 3), default=0)
 
 
 def _binary() -> str:

@@ -25,26 +25,13 @@ from magtwin.usd.maps.heat_map import HEAT_MAP, HEAT_MAP_HEIGHT_M
 
 Array = NDArray[np.float64]
 
-SCAN = "world/scan"
-"""Entity of the LiDAR scans."""
-
-SCANS = 64
-"""Scans per chunk."""
-
-POSE_HZ = 50.0
-"""Greatest rate of poses. No eye sees a difference above it."""
-
-DOT_HZ = 10.0
-"""Greatest rate of readings drawn along the path."""
-
-SCALE_HEIGHT_M = 1.0
-"""Height of the colour bar [m]: above desks and chairs, which would hide it on the floor."""
-
-ARROW_M_PER_NT = 1.4e-5
-"""Length of the field arrow: 70 cm for 50 uT."""
-
-DRIVEN: Colour = (230, 60, 60)
-"""Colour of a driven path."""
+SCAN = "world/scan"  # Entity of the LiDAR scans
+SCANS = 64  # Scans per chunk
+POSE_HZ = 50.0  # Greatest rate of poses. No eye sees a difference above it.
+DOT_HZ = 10.0  # Greatest rate of readings drawn along the path
+SCALE_HEIGHT_M = 1.0  # Height of the colour bar [m]: above desks and chairs, which would hide it on the floor
+ARROW_M_PER_NT = 1.4e-5  # Length of the field arrow: 70 cm for 50 uT
+DRIVEN: Colour = (230, 60, 60)  # Colour of a driven path
 
 
 @dataclass(frozen=True)
@@ -53,8 +40,7 @@ class Scale:
 
     low_nt: float
     high_nt: float
-    table: NDArray[np.uint8]
-    """Red, green, blue, opacity in sRGB, shape (256, 4)."""
+    table: NDArray[np.uint8]  # Red, green, blue, opacity in sRGB, shape (256, 4)
 
     @classmethod
     def over(cls, field: AnomalyMap, readings_nt: Array) -> "Scale":
@@ -95,11 +81,7 @@ class Interior:
 
     @classmethod
     def of(cls, twin: Twin) -> "Interior":
-        """The lab and the first robot of a twin.
-
-        Raises:
-            InputError: The stage cannot be read.
-        """
+        """The lab and the first robot of a twin."""
         shapes, links = geometry(twin)
         return cls(twin.scene.robot, shapes, links)
 
@@ -232,14 +214,10 @@ class Robot:
 
     rec: rr.RecordingStream
     interior: Interior
-    scale: Scale | None = None
-    """Colours of the readings along its path. None: only the path."""
+    scale: Scale | None = None  # Colours of the readings along its path. None: only the path.
     name: str = ""
-    colour: Colour = DRIVEN
-    """Colour of its path."""
-    rate_hz: float = 0.0
-    """Rows per second. 0: the rate of the first rows."""
-
+    colour: Colour = DRIVEN  # Colour of its path
+    rate_hz: float = 0.0  # Rows per second. 0: the rate of the first rows.
     _rows: int = 0
     _strides: tuple[int, int] | None = None
     _last: Run | None = None
@@ -333,11 +311,7 @@ class Robot:
                 send(rec, entity, t[known], rr.Arrows3D, vectors=arrows, origins=-arrows / 2)
 
     def _send_vector_style(self) -> None:
-        """Pose and style of the field arrow, in sensor axes.
-
-        The sensor is in the middle of the arrow, so half of the arrow is outside the robot however the field
-        dips. Its pose is relative to the robot, as the sensor's link may have no shape and so no entity.
-        """
+        """Pose and style of the field arrow in sensor axes, with its middle at the sensor."""
         entity = f"{entity_of('world/robot', self.name)}/magnetometer"
         robot = self.interior.robot
         place = _transform(robot.p_base_magnetometer, robot.q_base_magnetometer_xyzw)

@@ -8,24 +8,17 @@ from magtwin.frames import quat_conjugate, quat_from_yaw, rotate, yaw_from_quat
 
 Array = NDArray[np.float64]
 
-TURNED = 0.7
-"""Length of the mean unit vector of the headings above which a survey hardly turned."""
-
-ALIGNED = 0.8
-"""Ratio of the mean level field to its size above which it keeps one direction."""
-
-CLEARLY = 0.3
-"""Difference of these ratios from which headings or vectors are mirrored. Hard iron does not look so."""
-
-LEAST_READINGS = 8
-"""Fewest readings from which headings are judged."""
+TURNED = 0.7  # Length of the mean unit vector of the headings above which a survey hardly turned
+ALIGNED = 0.8  # Ratio of the mean level field to its size above which it keeps one direction
+CLEARLY = 0.3  # Difference of these ratios from which one is mirrored. Hard iron does not look so.
+LEAST_READINGS = 8  # Fewest readings from which headings are judged
 
 
 def levelled(vector_nt: Array, turn: Array, axes: str) -> Array:
-    """Vectors in the axes of a robot that stands upright: forward, left, up.
+    """Vectors in the axes of a robot that stands upright: forward, left, up; shape (N, 3).
 
     `turn` are headings [rad], shape (N,), or orientations xyzw of the body in world, shape (N, 4); `axes` are
-    those of `vector_nt`. The result, shape (N, 3), is in level axes that are turned by the heading alone.
+    those of `vector_nt`.
     """
     if turn.ndim == 1:
         return vector_nt if axes == "body" else rotate(quat_conjugate(quat_from_yaw(turn)), vector_nt)
@@ -38,15 +31,9 @@ def other_axes(vector_nt: Array, turn: Array, said: str) -> tuple[str, float]:
 
     With the level part v as a complex number and the heading h, a field that keeps its direction in world
     axes has a constant v exp(ih) for vectors in body axes, v for vectors in world axes, and v exp(-ih) for
-    headings that turn the other way, and for vectors that are forward, right, down ("mirrored").
-
-    Args:
-        vector_nt: Vectors, shape (N, 3).
-        turn: Headings or orientations, as for `levelled`.
-        said: Axes that were said: body or world.
-
-    Returns:
-        "" if those that were said are right, or nothing tells axes apart.
+    headings that turn the other way, and for vectors that are forward, right, down ("mirrored"). Vectors have
+    the shape (N, 3), `turn` is that of `levelled`. It is "" if the axes that were said, body or world, are
+    right, or nothing tells axes apart.
     """
     yaw = turn if turn.ndim == 1 else yaw_from_quat(turn)
     spin = np.exp(1j * yaw)

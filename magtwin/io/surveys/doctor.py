@@ -17,20 +17,11 @@ from magtwin.report.report import Figure, Report
 
 Array = NDArray[np.float64]
 
-FILTER_HZ = 5.0
-"""Rate at which the localizers read the field [Hz]."""
-
-SECTORS = 12
-"""Sectors of 30 degrees in which headings are counted."""
-
-LEAST_READINGS, LEAST_SPAN_M = 100, 0.5
-"""Fewest readings and least extent [m] of a map."""
-
-LEAST_SECTORS = 6
-"""Fewest sectors from which the hard iron is estimated, and from which a robot's own field can be told."""
-
-STEPS = 0.02
-"""Largest distance from a whole number of steps, in steps, of a value that a sensor rounded."""
+FILTER_HZ = 5.0  # Rate at which the localizers read the field [Hz]
+SECTORS = 12  # Sectors of 30 degrees in which headings are counted
+LEAST_READINGS, LEAST_SPAN_M = 100, 0.5  # Fewest readings and least extent [m] of a map
+LEAST_SECTORS = 6  # Fewest sectors for the hard iron, and for a robot's own field
+STEPS = 0.02  # Largest distance from a whole number of steps, in steps, of a value that a sensor rounded
 
 USES = {
     "map": ("pose",),
@@ -50,24 +41,16 @@ def examine(
     roles: Collection[str] = (),
     unit: str = "nT",
 ) -> Report:
-    """Examine a recorded field.
+    """Figures on a recorded field, and what it is fit for: metadata that begin with yes or no.
+
+    Magnitudes `b_nt` [nT], shape (N,), are by default those of the vectors `vector_nt`, shape (N, 3), in the
+    sensor's axes, z up or down. `t` are ascending times [s], `p_xy` positions [m], shape (N, 2), `yaw`
+    headings [rad]. `roles` are what else the recording holds: pose, odometry, imu, battery, commands, scan.
+    `unit` is that of the file, and how it is known, such as "uT, by its size".
 
     The hard iron is the centre of the circle that level vectors lie on (I. Kasa, "A circle fitting procedure
     and its error analysis", 1976). What a filter at `FILTER_HZ` aliases is the rest about means over its
     period.
-
-    Args:
-        b_nt: Magnitudes [nT], shape (N,). Default: those of the vectors.
-        vector_nt: Vectors in the sensor's axes, z up or down [nT], shape (N, 3).
-        t: Times [s], ascending, shape (N,).
-        p_xy: Positions [m], shape (N, 2).
-        yaw: Headings [rad], shape (N,).
-        roles: What else the recording holds: pose, odometry, imu, battery, commands, scan.
-        unit: Unit of the file, and how it is known, such as "uT, by its size".
-
-    Returns:
-        Figures on the field. The metadata have "fit for a map", "fit for training" and "fit for
-        localization", which begin with yes or no.
     """
     if b_nt is None:
         if vector_nt is None:
@@ -101,11 +84,7 @@ def examine(
 
 
 def info_of_survey(file: Path) -> Report:
-    """What the field in a table or a log is like, what it is fit for, and the command to type next.
-
-    Raises:
-        InputError: There is no field in it, or it is damaged.
-    """
+    """What the field in a table or a log is like, what it is fit for, and the command to type next."""
     from magtwin.io.surveys.logs import table_of_log
     from magtwin.io.surveys.readings import read_readings
     from magtwin.io.surveys.tabled import field_of_table

@@ -23,8 +23,7 @@ from magtwin.tables.table import PARQUET, SPREADSHEETS, Column, Table, read_tabl
 Array = NDArray[np.float64]
 Parts = Mapping[str, Table]
 
-VEHICLES = (".ulg", ".bin", ".h5", ".hdf5")
-"""Suffixes of the logs that `magtwin.io.surveys.vehicles` reads."""
+VEHICLES = (".ulg", ".bin", ".h5", ".hdf5")  # Suffixes of the logs that `magtwin.io.surveys.vehicles` reads
 
 TABLES = (".csv", ".txt", *SPREADSHEETS)
 FIELD = ("magnetometer", "magnetic", "mag", "magneticfield", "raw")
@@ -32,14 +31,9 @@ MARKS = ("annotation", "annotations", "waypoint", "waypoints", "mark", "marks", 
 ACCELERATION = ("accelerometer", "acceleration", "acc", "accel", "linear")
 """Words in the names of the tables of a log."""
 
-MOST_PARTS = 200
-"""Most tables of a log."""
-
-_TRACE = re.compile(rb"^\d+\tTYPE_[A-Z_]+\t", re.M)
-"""A line of a trace of an Android phone: time [ms], sensor, values."""
-
-BETWEEN = 0.2
-"""Share of the rows below which rows with places are marks, and others lie between them."""
+MOST_PARTS = 200  # Most tables of a log
+_TRACE = re.compile(rb"^\d+\tTYPE_[A-Z_]+\t", re.M)  # A line of an Android trace: time [ms], sensor, values
+BETWEEN = 0.2  # Share of the rows below which rows with places are marks, and others lie between them
 
 
 def is_log(path: Path) -> bool:
@@ -60,15 +54,10 @@ def is_survey(path: Path) -> bool:
 
 
 def table_of_log(path: Path, waypoints: Path | None = None) -> Table:
-    """The readings of a log, with their places.
+    """The readings of a log, with their places, by a table of marks `waypoints` if the log has none.
 
-    Args:
-        path: A table; a folder or a zip of tables, as phyphox and Sensor Logger write them; a trace of an
-            Android phone; or a log of a vehicle: PX4 (.ulg), ArduPilot (.bin) or HDF5.
-        waypoints: A table of marks, if the log has none.
-
-    Raises:
-        InputError: There is no field in it, or a part is damaged.
+    A log is a table; a folder or a zip of tables, as phyphox and Sensor Logger write them; a trace of an
+    Android phone; or a log of a vehicle: PX4 (.ulg), ArduPilot (.bin) or HDF5.
     """
     if is_log(path):
         parts = _parts(path)

@@ -29,14 +29,9 @@ Split = Literal["checkerboard", "heading", "run", "block"]
 Progress = Callable[..., None]
 Vector = tuple[float, float, float]
 
-LEAST_READINGS = 8
-"""Smallest number of good readings that a map can be fitted to."""
-
-USUAL_READINGS = 100
-"""Number of good readings below which the report doubts the map."""
-
-MOST_MASKED = 0.9
-"""Share of masked nodes above which the report doubts the map."""
+LEAST_READINGS = 8  # Smallest number of good readings that a map can be fitted to
+USUAL_READINGS = 100  # Number of good readings below which the report doubts the map
+MOST_MASKED = 0.9  # Share of masked nodes above which the report doubts the map
 
 
 def import_survey(
@@ -128,13 +123,7 @@ def _fitted(
 
     doubts = [*_doubts(readings), *_shared(readings, method)]
     model = fit(readings, method, progress=progress, **options)
-    field = raster(
-        model,
-        readings,
-        spacing_m=spacing_m,
-        headings_rad=headings_rad,
-        progress=progress,
-    )
+    field = raster(model, readings, spacing_m=spacing_m, headings_rad=headings_rad, progress=progress)
     save_map(field, out, force=force)
     report = _with_doubts(report, [*doubts, *_masked(field)])
     return _joined(field.report(), choice_report(field.parameters), grid_report(field), report)

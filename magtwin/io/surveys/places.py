@@ -5,21 +5,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-AXIS_M, FLATTENING = 6_378_137.0, 1 / 298.257223563
-"""Semi-major axis and flattening of WGS 84 (NIMA TR8350.2, table 3.1)."""
+AXIS_M, FLATTENING = 6_378_137.0, 1 / 298.257223563  # WGS 84 (NIMA TR8350.2, table 3.1)
 
 
 def on_tangent_plane(lat_deg: Array, lon_deg: Array) -> tuple[Array, str]:
-    """Positions east and north of their middle, on the plane that touches WGS 84 there.
+    """Positions east and north of their middle on the plane that touches WGS 84 there, and that in words.
 
-    The plane shortens a distance d from the middle by about d^3 / (6 R^2): 6 cm in 25 km.
-
-    Args:
-        lat_deg: Geodetic latitudes [deg], shape (N,); nan where unknown.
-        lon_deg: Longitudes [deg], shape (N,).
-
-    Returns:
-        Positions [m], shape (N, 2), and the words for their origin.
+    Geodetic latitudes and longitudes [deg], shape (N,), nan where unknown, become [m], shape (N, 2). The
+    plane shortens a distance d from the middle by about d^3 / (6 R^2): 6 cm in 25 km.
     """
     known = np.isfinite(lat_deg) & np.isfinite(lon_deg)
     turn = np.exp(1j * np.radians(lon_deg[known])).mean() if known.any() else 1.0

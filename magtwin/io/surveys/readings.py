@@ -28,8 +28,7 @@ from magtwin.tables.table import PARQUET, read_table
 
 Source = str | os.PathLike[str]
 
-POSE, MAGNITUDE = "/robot/enu/pose", "/robot/qtfm/magnitude"
-"""Names of the topics of poses and magnitudes in `magtwin.io.bags.topics`."""
+POSE, MAGNITUDE = "/robot/enu/pose", "/robot/qtfm/magnitude"  # In `magtwin.io.bags.topics`
 
 
 def read_readings(
@@ -45,10 +44,10 @@ def read_readings(
 
     A source is a folder of one CSV per heading (`magtwin.field.survey.folder`); a table of readings, CSV or
     Parquet or a spreadsheet; a log of a phone or vehicle (`magtwin.io.surveys.logs`); several files with
-    matching rows, joined by `+` (`1-time.csv+1-loc.csv+1-mag.csv`; the others are
-    searched for beside the first); the Parquet of a Run or of Readings; or a rosbag2, as a folder or a
-    storage file. Several sources are several runs of one survey, as are the files of a pattern
-    (`drives/*.parquet`) and the Parquet files of a folder, in the order of their names.
+    matching rows, joined by `+` (`1-time.csv+1-loc.csv+1-mag.csv`; the others are beside the first); the
+    Parquet of a Run or of Readings; or a rosbag2, as a folder or a storage file. Several sources are several
+    runs of one survey, as are the files of a pattern (`drives/*.parquet`) and the Parquet files of a folder,
+    in the order of their names.
 
     Args:
         sources: One or more sources.
@@ -90,16 +89,9 @@ def read_readings(
 def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
     """The readings of a Run: its measured field at the true pose of base_link.
 
-    Rows whose field is nan (outside the map) are left out; rows with lost lock are not good. Of a robot's
-    recording, rows between whose poses there is a gap are left out too, and vectors are read.
-
-    Args:
-        run: A run with p_world_base, yaw and b_measured_nt, or b_total_nt.
-        name: Name of the readings.
-        source: Source of the run.
-
-    Raises:
-        InputError: A column is missing, or no row has a field.
+    The run has p_world_base, yaw and b_measured_nt, or b_total_nt. Rows whose field is nan (outside the map)
+    are left out; rows with lost lock are not good. Of a robot's recording, rows between whose poses there is
+    a gap are left out too, and vectors are read.
     """
     field = next((c for c in ("b_measured_nt", "b_total_nt") if c in run and np.isfinite(run[c]).any()), None)
     if field is None:

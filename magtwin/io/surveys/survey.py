@@ -51,10 +51,8 @@ def survey_and_report(
 ) -> tuple[Readings, Report]:
     """Readings of a survey of any form, with stuck readings masked, and the report on them.
 
-    Of values that a logger faster than the sensor repeated, one reading each is kept.
-
-    `reading` are `columns`, `pose_topic` and `field_topic` of `read_readings`, `about` metadata that the
-    files lack.
+    Of values that a logger faster than the sensor repeated, one reading each is kept. `reading` are
+    `columns`, `pose_topic` and `field_topic` of `read_readings`, `about` metadata that the files lack.
     """
     known = {} if about is None else {**asdict(about), "name": None}  # errors name the file
     readings = read_readings(*sources, **reading, **known)

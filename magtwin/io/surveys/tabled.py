@@ -23,28 +23,16 @@ from magtwin.tables.table import Table, since_1970
 
 Array = NDArray[np.float64]
 
-LEAST_SPAN_M = 0.01
-"""Extent below which the report asks whether positions are in degrees [m]."""
-
-APART = 2.0
-"""Largest median ratio between vectors and magnitudes of the same table."""
-
-SAME_LENGTH = 0.01
-"""Largest median difference of x, y, z from the magnitude by which they are its components."""
+LEAST_SPAN_M = 0.01  # Extent below which the report asks whether positions are in degrees [m]
+APART = 2.0  # Largest median ratio between vectors and magnitudes of the same table
+SAME_LENGTH = 0.01  # Largest median difference of x, y, z from the magnitude by which they are its components
 
 
 def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Readings:
-    """The readings in a table.
+    """The readings in a table, of which the user `told` some columns; name and source are of its files.
 
-    Args:
-        table: The table.
-        told: What the user told about its columns.
-        name: Name of the readings and of their run.
-        source: Its files, with checksums.
-
-    Raises:
-        InputError: A column is missing (the text has the nearest name), a cell is not a number (with file and
-            line), no unit fits, or columns contradict each other.
+    Refused are a column that is missing, with the nearest name; a cell that is no number, with file and line;
+    a field that is in no unit, and columns that contradict each other.
     """
     columns, taken = _complete(table, told)
     p, datum = _positions(table, columns, taken)
@@ -106,11 +94,7 @@ def _within_steps(vector: Array, b: Array, taken: list[str]) -> tuple[Array, flo
 
 
 def field_of_table(table: Table) -> tuple[Array | None, Array, Array | None, str]:
-    """Vectors, magnitudes [nT] and times [s] of a table that may lack positions, and the unit of the field.
-
-    Raises:
-        InputError: There is no field in it, or a cell is not a number.
-    """
+    """Vectors, magnitudes [nT] and times [s] of a table that may lack positions, and the field's unit."""
     columns, taken = _complete(table, Columns(heading=NO_HEADING), placed=False)
     vector, b = _field(table, columns)
     return vector, b, _times(table, columns, columns, taken), columns.unit or "nT"

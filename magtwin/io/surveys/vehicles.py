@@ -30,11 +30,7 @@ of which mag_1_uc is the magnetometer on the tail, not compensated."""
 
 
 def columns_of_log(path: Path) -> Columns:
-    """The columns of a log, by its suffix.
-
-    Raises:
-        InputError: The log is damaged or has no field, or the library that reads it is missing.
-    """
+    """The columns of a log, by its suffix."""
     readers = {".ulg": (_px4, "pyulog"), ".bin": (_ardupilot, "pymavlink")}
     read, library = readers.get(path.suffix.lower(), (_flight, "h5py"))
     try:
@@ -139,10 +135,7 @@ def _flight(path: Path) -> Columns:
 
 
 def _levelled(b: Array, roll: Array, pitch: Array, yaw: Array) -> Columns:
-    """Vectors in axes forward, right, down as level ones forward, left, up; and the heading from east.
-
-    Angles [rad] are those of a body in axes north, east, down.
-    """
+    """Vectors forward, right, down as level ones forward, left, up, by angles [rad] to north, east, down."""
     x, y, z = b.T
     right = np.cos(roll) * y - np.sin(roll) * z
     below = np.sin(roll) * y + np.cos(roll) * z

@@ -18,14 +18,9 @@ NOTES = ("text", "note", "notes", "annotation", "comment", "label", "remark", "e
 _PLACE = re.compile(r"\D*?([+-]?\d+(?:\.\d+)?)\s*[,;/ ]\s*(?:y\s*=?\s*)?([+-]?\d+(?:\.\d+)?)\s*\D*", re.ASCII)
 """A place in a note: `1.5,2`, `(1.5; 2)` or `x=1.5 y=2`."""
 
-LEAST_COVERED = 0.1
-"""Share of the log's time below which marks must be in another unit."""
-
-STILL_M_S2 = 0.4
-"""Standard deviation of the acceleration within a second below which nobody walks [m/s^2]."""
-
-LEAST_PAUSE_S = 1.5
-"""Shortest pause that counts [s]."""
+LEAST_COVERED = 0.1  # Share of the log's time below which marks must be in another unit
+STILL_M_S2 = 0.4  # Standard deviation of the acceleration within a second below which nobody walks [m/s^2]
+LEAST_PAUSE_S = 1.5  # Shortest pause that counts [s]
 
 QUIET, LIVELY = 4.0, 20.0
 """Changes of the field within a second, in standard deviations of its means over a second: below the first
@@ -36,22 +31,13 @@ in a pause, and above the second usually. Fields that hardly change show no paus
 class Marks:
     """When a walker passed which places."""
 
-    t: Array
-    """Times [s], ascending, shape (M,)."""
-
-    p_xy: Array
-    """Places [m], shape (M, 2)."""
-
-    name: str
-    """Their file."""
+    t: Array  # Times [s], ascending, shape (M,)
+    p_xy: Array  # Places [m], shape (M, 2)
+    name: str  # Their file
 
 
 def marks_of(table: Table) -> Marks | None:
-    """The marks in a table: columns of time, x and y, or of time and of notes such as `1.5,2`; None if none.
-
-    Raises:
-        InputError: There is one mark only, or two at one time.
-    """
+    """The marks in a table: columns t, x and y, or t and notes such as `1.5,2`; None if it has none."""
     name = "".join(table.find("t"))
     if not name:
         return None
@@ -77,16 +63,9 @@ def marks_of(table: Table) -> Marks | None:
 def walked(table: Table, marks: Marks, moving: tuple[Array, Array] | None = None) -> Table:
     """A table of readings with the columns x and y of a walk: from mark to mark at a steady pace.
 
-    In pauses the walker stands still. Rows before the first mark and behind the last have no place.
-
-    Args:
-        table: Readings with a column of time.
-        marks: The marks, in the clock of the table or in seconds since its first row.
-        moving: Times [s] and accelerations [m/s^2] of the walker, shapes (K,) and (K, 3), by which pauses are
-            found. Default: pauses are where the field does not change.
-
-    Raises:
-        InputError: The table has no times, or marks and rows share no time.
+    In pauses the walker stands still. They are found by times [s] and accelerations [m/s^2] `moving`, shapes
+    (K,) and (K, 3), or else where the field does not change. Rows before the first mark and behind the last
+    have no place. Marks are in the clock of the table, or in seconds since its first row.
     """
     name = "".join(table.find("t"))
     if not name:
