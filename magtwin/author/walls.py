@@ -1,15 +1,18 @@
 """Walls, doors and windows of a scene's TOML, their default magnetization, and what stands in them."""
 
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
+import numpy as np
+
 from magtwin.author.furniture import drawn_magnetization
-from magtwin.errors import InputError
+from magtwin.errors import InputError, MismatchWarning
 from magtwin.files.settings import refused_at
 from magtwin.spec.furniture import BODY, MATERIALS, FurnitureSpec, Part
-from magtwin.spec.lab import LabSpec
+from magtwin.spec.lab import LabSpec, beyond_m
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.walls import NO_LEAF, Door, Structure, Wall, Window, overlap_m
 from magtwin.usd.lab.furniture import FURNITURE
@@ -19,6 +22,9 @@ W = TypeVar("W", Wall, Door)
 
 IN_WALL_M = 0.01
 """Furniture that is not deeper in a wall than this touches it [m]."""
+
+STEP_M = 0.05
+"""Steps along a wall at which it is seen whether it is on the floor [m]."""
 
 
 @dataclass(frozen=True)
@@ -96,13 +102,27 @@ def lab_with_walls(
         return lab
     for section, number, key, text in Structure.named(walls, doors, windows, lab.sides).faults():
         raise refused_at(path, key, text, section=section, number=number)
-    return with_walls(lab, walls, doors, windows, seed=seed)
+    made = with_walls(lab, walls, doors, windows, seed=seed)
+    for number, wall in enumerate(made.walls):
+        steps = np.linspace(0, wall.length_m, max(2, int(wall.length_m / STEP_M)))
+        beyond = beyond_m(np.array([wall.at(s, 0) for s in steps]), lab.corners)
+        farthest = int(beyond.argmax())
+        if beyond[farthest] > lab.wall_thickness_m + lab.apron_m + wall.thickness_m / 2:
+            x, y = wall.at(float(steps[farthest]), 0)
+            text = (
+                f"wall {wall.name!r} reaches {beyond[farthest]:.2f} m off the floor at ({x:.2f}, {y:.2f}); end it "
+                f"at the floor's border, or enlarge {'floor' if lab.floor else 'floor_m'} of [lab]"
+            )
+            key = "to" if 2 * farthest >= len(steps) else "from"
+            raise refused_at(path, key, text, section="wall", number=number)
+    return made
 
 
 def check_not_in_walls(
     pieces: Sequence[FurnitureSpec], lab: LabSpec, obstacles: Obstacles, path: str | os.PathLike[str]
 ) -> None:
-    """Refuse furniture that stands in a wall or in the leaf of a door.
+    """Refuse furniture that stands in a wall, in the leaf of a door, or through a side of a floor with
+    corners. Warn of a piece that stands through a side of a rectangle.
 
     Args:
         pieces: Furniture, in the order of its tables in `path`.
@@ -113,25 +133,29 @@ def check_not_in_walls(
     Raises:
         InputError: A piece does; the text has its line, the wall and the depth.
     """
-    if not lab.walls:
-        return
     placed = list(zip(obstacles.names, obstacles.outlines, strict=True))
     own = {wall.name for wall in lab.walls}
-    walls = [(name, o) for name, o in placed if name.startswith(f"{WALLS}/") and name.split("/")[4] in own]
+    walls = [(name.split("/")[4:], outline) for name, outline in placed if name.startswith(f"{WALLS}/")]
     numbers = {piece.name: number for number, piece in enumerate(pieces)}
+    parts: dict[str, list[np.ndarray]] = {}
     for name, outline in placed:
-        if not name.startswith(f"{FURNITURE}/"):
-            continue
-        piece = name.split("/")[3]
+        if name.startswith(f"{FURNITURE}/"):
+            parts.setdefault(name.split("/")[3], []).append(outline)
+    for piece, outlines in parts.items():
+        whole = Obstacles((piece,), (np.concatenate(outlines),)).outlines  # a table's legs are beside a side
         for wall_name, wall in walls:
-            if (deep := overlap_m(outline, wall)) > IN_WALL_M:
-                parts = wall_name.split("/")[4:]
-                what = f"door {parts[1]!r}" if parts[-1] == "leaf" else f"wall {parts[0]!r}"
-                x, y = outline.mean(axis=0)
-                text = (
-                    f"{piece!r} stands {deep:.2f} m deep in {what} at ({x:.2f}, {y:.2f}); move it, or end "
-                    "the wall there"
-                )
-                if piece not in numbers:
-                    raise InputError(f"{path}: {text}")
+            inner = wall_name[0] in own
+            depths = [(overlap_m(outline, wall), outline) for outline in (outlines if inner else whole)]
+            deep, outline = max(depths, key=lambda each: each[0])
+            if deep <= IN_WALL_M:
+                continue
+            what = f"door {wall_name[1]!r}" if wall_name[-1] == "leaf" else f"wall {wall_name[0]!r}"
+            x, y = outline.mean(axis=0)
+            text = f"{piece!r} stands {deep:.2f} m deep in {what} at ({x:.2f}, {y:.2f}); move it"
+            text += ", or end the wall there" if inner else " onto the floor"
+            if not (inner or lab.floor):
+                warnings.warn(f"{path}: {text}", MismatchWarning, stacklevel=2)
+            elif piece not in numbers:
+                raise InputError(f"{path}: {text}")
+            else:
                 raise refused_at(path, "p_world", text, section="furniture", number=numbers[piece])

@@ -319,7 +319,12 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
                 _from_table(a, v, where.inside(key, k))
                 for k, (a, v) in enumerate(zip(args, value, strict=True))
             )
-        return tuple(_value(a, v, where, key) for a, v in zip(args, value, strict=True))
+        try:
+            return tuple(_value(a, v, where, key) for a, v in zip(args, value, strict=True))
+        except InputError as error:
+            if set(args) != {float}:
+                raise
+            raise wrong() from error
     if origin is typing.Literal:
         if value not in args:
             raise where.refused(key, f"{key} must be one of {', '.join(map(repr, args))}, got {value!r}")

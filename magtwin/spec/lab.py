@@ -148,6 +148,16 @@ def on_polygon(p_xy: NDArray[np.float64], corners: Sequence[Vec2]) -> NDArray[np
     return inside | border
 
 
+def beyond_m(p_xy: NDArray[np.float64], corners: Sequence[Vec2]) -> NDArray[np.float64]:
+    """Distance of points (N, 2) from a polygon [m], 0 in it, shape (N,)."""
+    ends = np.array(corners, float)
+    side = np.roll(ends, -1, axis=0) - ends
+    to = p_xy[:, None] - ends
+    along = np.clip((to * side).sum(axis=2) / (side**2).sum(axis=1), 0, 1)
+    away = np.hypot(*np.moveaxis(to - along[..., None] * side, 2, 0)).min(axis=1)
+    return np.where(on_polygon(p_xy, corners), 0.0, away)
+
+
 @lru_cache(maxsize=64)
 def check_corners(corners: tuple[Vec2, ...]) -> None:
     """Refuse a floor whose corners are not those of a polygon.
