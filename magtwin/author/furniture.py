@@ -203,10 +203,8 @@ def check_stands(piece: FurnitureSpec, lab: LabSpec) -> None:
     off = float(beyond_m(world[:, :2], lab.corners).max()) if lab.floor else 0.0
     if off > lab.wall_thickness_m + lab.apron_m + 1e-6:
         raise InputError(
-            "p_world of {!r} is ({:g}, {:g}): it reaches {:.2f} m off the floor, whose corners leave that place "
-            "out; move it onto the floor, or change floor of [lab]".format(
-                piece.name, *piece.p_world[:2], off
-            )
+            f"p_world of {piece.name!r} is ({piece.p_world[0]:g}, {piece.p_world[1]:g}): it reaches {off:.2f} m "
+            "off the floor, whose corners leave that place out; move it, or change floor of [lab]"
         )
 
 

@@ -110,8 +110,8 @@ def lab_with_walls(
         if beyond[farthest] > lab.wall_thickness_m + lab.apron_m + wall.thickness_m / 2:
             x, y = wall.at(float(steps[farthest]), 0)
             text = (
-                f"wall {wall.name!r} reaches {beyond[farthest]:.2f} m off the floor at ({x:.2f}, {y:.2f}); end it "
-                f"at the floor's border, or enlarge {'floor' if lab.floor else 'floor_m'} of [lab]"
+                f"wall {wall.name!r} reaches {beyond[farthest]:.2f} m off the floor at ({x:.2f}, {y:.2f}); "
+                f"end it at the floor's border, or enlarge {'floor' if lab.floor else 'floor_m'} of [lab]"
             )
             key = "to" if 2 * farthest >= len(steps) else "from"
             raise refused_at(path, key, text, section="wall", number=number)

@@ -113,8 +113,8 @@ def simulate(
     seed = checked_seed(seed)
     twin = opened(twin, network, magnetometer, model_error, "simulate")
     if twin.scene.others:
-        names = ", ".join(repr(other.robot.name) for other in twin.scene.others)
-        text = f"simulate drives {twin.scene.robot.name!r} alone and leaves out {names}; simulate_robots drives all"
+        first, *others = (repr(placed.robot.name) for placed in twin.scene.robots)
+        text = f"simulate drives {first} alone, without {', '.join(others)}; simulate_robots drives all"
         warnings.warn(text, MismatchWarning, stacklevel=2)
     twin = in_session(with_plant(twin, plant), session, seed=seed)
     check_field(twin.scene, twin.field)

@@ -264,6 +264,7 @@ def test_default_magnetization_is_that_of_steel_in_the_wall():
 
 
 WALL = '[[wall]]\nname = "a"\nfrom = [0, 1]\nto = [4, 1]\n'
+SHELF = '[[furniture]]\nname = "shelf"\nkind = "shelf"\np_world = [{}, {}, 0]\n'
 DOOR = '[[door]]\nwall = "a"\nat_m = 2\n'
 
 
@@ -314,11 +315,21 @@ DOOR = '[[door]]\nwall = "a"\nat_m = 2\n'
         ),
         (
             "",
-            WALL + '[[furniture]]\nname = "shelf"\nkind = "shelf"\np_world = [1, 1.1, 0]\n',
+            WALL.replace("4, 1", "3, 1")
+            + '[[furniture]]\nname = "shelf"\nkind = "shelf"\np_world = [1, 1.1, 0]\n',
             "p_world",
             "'shelf' stands .* m deep in wall 'a'",
         ),
         ("", "[[window]]\nwall = 'a'\nat_m = 1\n", "wall", "the room has none|known: east"),
+        ("", WALL, "to", r"'a' reaches 1.00 m off the floor at \(4.00, 1.00\); end it"),
+        (f"floor = {CORNERS}", WALL.replace("[4, 1]", "[8, 5]"), "to", "reaches 2.00 m off the floor"),
+        (
+            f"floor = {CORNERS}",
+            SHELF.format(7, 4),
+            "p_world",
+            "it reaches 1.50 m off the floor, whose corners",
+        ),
+        (f"floor = {CORNERS}", SHELF.format(9, 1.5), "p_world", "0.05 m deep in wall 'edge_1'"),
     ],
 )
 def test_walls_that_cannot_be_are_refused_with_line_place_and_the_way_on(tmp_path, lab, more, line, said):
@@ -332,6 +343,13 @@ def test_walls_that_cannot_be_are_refused_with_line_place_and_the_way_on(tmp_pat
         scene_from_toml(file)
     number = int(str(refusal.value).split(":")[1])
     assert file.read_text(encoding="utf-8").splitlines()[number - 1].startswith(line)
+
+
+def test_a_piece_through_a_side_of_a_rectangle_is_told_and_one_on_the_apron_is_not(tmp_path):
+    text = L_ROOM.split("lab = ")[0] + L_ROOM[L_ROOM.index("earth") : L_ROOM.index("wall = ")]
+    file = written(tmp_path, text + SHELF.format(-3, 0))
+    with pytest.warns(MismatchWarning, match="'shelf' stands 0.05 m deep in wall 'West'.*onto the floor"):
+        scene_from_toml(file)
 
 
 def test_a_path_through_a_closed_room_is_refused_with_the_wall(l_room):
