@@ -203,8 +203,8 @@ def check_stands(piece: FurnitureSpec, lab: LabSpec) -> None:
     off = float(beyond_m(world[:, :2], lab.corners).max()) if lab.floor else 0.0
     if off > lab.wall_thickness_m + lab.apron_m + 1e-6:
         raise InputError(
-            f"p_world of {piece.name!r} is ({piece.p_world[0]:g}, {piece.p_world[1]:g}): it reaches {off:.2f} "
-            "m off the floor, whose corners leave that place out; move it, or change floor of [lab]"
+            f"p_world of {piece.name!r} is ({piece.p_world[0]:g}, {piece.p_world[1]:g}): it reaches "
+            f"{off:.2f} m off the floor, whose corners leave that place out; move it, or change floor"
         )
 
 

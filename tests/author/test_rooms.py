@@ -168,7 +168,7 @@ def test_each_call_leaves_the_room_as_it_was():
         (lambda room: room.wall((0, -2), (0, 2)).shelf((0, 0)).robot(at=(2, 0)).scene, "deep in wall"),
         (lambda room: room.magnet((0, 0)), "needs m_world"),
         (lambda room: room.magnet((0, 0), m_world=5), "m_world must be a list of 3, each a number, got 5"),
-        (lambda room: room.wall((1, 0), (5, 0)), r"'wall_0' reaches 2.00 m off the floor at \(5.00, 0.00\)"),
+        (lambda room: room.wall((4, 0), (5, 0)), r"stands off the floor .* 2.00 m .* at \(5.00, 0.00\)"),
         (lambda room: room.earth(100, 0), "latitude_deg"),
         (lambda room: room.survey(spacing=1), "did you mean 'spacing_m'"),
         (lambda room: room.robot("turtelbot4"), "no robot 'turtelbot4'; known: turtlebot4"),

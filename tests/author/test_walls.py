@@ -315,20 +315,18 @@ DOOR = '[[door]]\nwall = "a"\nat_m = 2\n'
         ),
         (
             "",
-            WALL.replace("4, 1", "3, 1")
-            + '[[furniture]]\nname = "shelf"\nkind = "shelf"\np_world = [1, 1.1, 0]\n',
+            WALL + SHELF.format(1, 1.1),
             "p_world",
             "'shelf' stands .* m deep in wall 'a'",
         ),
         ("", "[[window]]\nwall = 'a'\nat_m = 1\n", "wall", "the room has none|known: east"),
-        ("", WALL, "to", r"'a' reaches 1.00 m off the floor at \(4.00, 1.00\); end it"),
-        (f"floor = {CORNERS}", WALL.replace("[4, 1]", "[8, 5]"), "to", "reaches 2.00 m off the floor"),
         (
             f"floor = {CORNERS}",
-            SHELF.format(7, 4),
-            "p_world",
-            "it reaches 1.50 m off the floor, whose corners",
+            WALL.replace("[0, 1]", "[6, 4]").replace("4, 1", "8, 4"),
+            "from",
+            "off the floor",
         ),
+        (f"floor = {CORNERS}", SHELF.format(7, 4), "p_world", "reaches 1.50 m off the floor, whose corners"),
         (f"floor = {CORNERS}", SHELF.format(9, 1.5), "p_world", "0.05 m deep in wall 'edge_1'"),
     ],
 )
@@ -345,11 +343,13 @@ def test_walls_that_cannot_be_are_refused_with_line_place_and_the_way_on(tmp_pat
     assert file.read_text(encoding="utf-8").splitlines()[number - 1].startswith(line)
 
 
-def test_a_piece_through_a_side_of_a_rectangle_is_told_and_one_on_the_apron_is_not(tmp_path):
+def test_what_stands_through_a_side_of_a_rectangle_is_told(tmp_path):
     text = L_ROOM.split("lab = ")[0] + L_ROOM[L_ROOM.index("earth") : L_ROOM.index("wall = ")]
-    file = written(tmp_path, text + SHELF.format(-3, 0))
-    with pytest.warns(MismatchWarning, match="'shelf' stands 0.05 m deep in wall 'West'.*onto the floor"):
+    file = written(tmp_path, text + WALL + SHELF.format(-3, 0))
+    with pytest.warns(MismatchWarning) as told:
         scene_from_toml(file)
+    assert "'shelf' stands 0.05 m deep in wall 'West'" in str(told[-1].message)
+    assert "wall 'a' reaches 1.00 m off the floor at (4.00, 1.00); end it" in str(told[0].message)
 
 
 def test_a_path_through_a_closed_room_is_refused_with_the_wall(l_room):
