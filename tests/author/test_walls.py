@@ -82,13 +82,13 @@ def lab_room(lab: LabSpec, radius: float = 0.171) -> Room:
     return Room(lab.floor_m, radius, obstacles_in(lab, ()), lab.border)
 
 
-def test_a_stage_of_walls_reads_back_as_its_toml_and_is_valid(l_room):
+def test_a_stage_of_walls_reads_back_as_its_toml_and_is_valid(l_room, tmp_path):
     scene, stage = l_room
     opened = open_scene(stage)
     assert opened.scene.lab == scene.lab
     assert opened.scene.magnets == scene.magnets
     assert opened.changes == ()
-    assert_valid(stage)
+    assert_valid(stage, tmp_path)
 
 
 def test_every_key_of_walls_doors_and_windows_goes_into_the_stage_and_back(tmp_path):
