@@ -319,12 +319,9 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
                 _from_table(a, v, where.inside(key, k))
                 for k, (a, v) in enumerate(zip(args, value, strict=True))
             )
-        try:
-            return tuple(_value(a, v, where, key) for a, v in zip(args, value, strict=True))
-        except InputError as error:
-            if set(args) != {float}:
-                raise
-            raise wrong() from error
+        if set(args) == {float} and any(isinstance(v, str) for v in value):
+            raise wrong()
+        return tuple(_value(a, v, where, key) for a, v in zip(args, value, strict=True))
     if origin is typing.Literal:
         if value not in args:
             raise where.refused(key, f"{key} must be one of {', '.join(map(repr, args))}, got {value!r}")

@@ -121,6 +121,10 @@ class Runs(Summarized, Sequence[Run]):
             with suppress(ImportError):  # plain Python gives the same bytes
                 warm_up()
 
+    def scene_of(self, index: int) -> int | None:
+        """Number of a run's scene among those of the sweep, from 0. None if there is one."""
+        return self._jobs[index].place
+
     def __len__(self) -> int:
         return len(self._jobs)
 
@@ -129,10 +133,6 @@ class Runs(Summarized, Sequence[Run]):
 
     @overload
     def __getitem__(self, index: slice) -> list[Run]: ...
-
-    def scene_of(self, index: int) -> int | None:
-        """Number of a run's scene among those of the sweep, from 0. None if there is one."""
-        return self._jobs[index].place
 
     def __getitem__(self, index: int | slice) -> Run | list[Run]:
         numbers = range(len(self))[index]
