@@ -160,8 +160,30 @@ magtwin new room.toml --plan map.pgm
   rectangle thinner than 0.6 m is one wall.
 * **Doors and windows** are lines across their opening, in a wall or in a gap between walls.
 * **Floor**: the closed line around all others, or else what the walls enclose, across gaps up to 1.3 m.
-* **Scale.** `--scale` is metres per unit of the drawing. A plan without one is refused, with its size in
-  units.
+  Walls off the floor are left out.
+* **Scale.** `--scale` is metres per unit of the drawing; of an SVG, per unit of its viewBox. A sheet at 1:50
+  drawn in mm needs `--scale 0.05`, since 1 mm is 0.05 m. Without it, an SVG with a width in mm has its size
+  on paper, which is too small for a room and refused; so is a plan without any scale, with its size in units.
+* **Axes.** y of an SVG counts down, y of the room counts up: what is low on the sheet has the small y. The
+  origin is the lower left corner of the walls.
+
+An SVG at 1:50, of two rooms of 4 x 5 m with a door between them and one to the outside in the lower wall:
+
+```
+<svg xmlns="http://www.w3.org/2000/svg" width="180mm" height="120mm" viewBox="0 0 180 120">
+  <g id="walls" fill="none" stroke="black" stroke-width="2">
+    <rect x="10" y="10" width="160" height="100"/>
+    <line x1="90" y1="10" x2="90" y2="110"/>
+  </g>
+  <g id="doors" stroke="red">
+    <line x1="90" y1="50" x2="90" y2="70"/>
+    <line x1="30" y1="110" x2="50" y2="110"/>
+  </g>
+</svg>
+```
+
+`magtwin new rooms.toml --plan plan.svg --scale 0.05` makes of it a floor of 8 x 5 m, a wall from (4, 5) to
+(4, 0), and doors of 1 m at (4, 2.5) and (1.5, 0).
 
 ## A lab in another place
 

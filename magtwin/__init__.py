@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from magtwin.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from magtwin import extend as extend
     from magtwin.author.from_urdf import from_urdf as from_urdf
     from magtwin.author.rooms import Room as Room
     from magtwin.bench.results import read_results as read_results
@@ -147,6 +148,8 @@ __all__ = sorted(_NAMES)
 
 
 def __getattr__(name: str) -> object:
+    if name == "extend":  # its decorators are used as `magtwin.extend.network`
+        return importlib.import_module("magtwin.extend")
     if name not in _NAMES:
         raise AttributeError(f"module 'magtwin' has no attribute {name!r}")
     module, _, attribute = _NAMES[name].partition(":")
@@ -154,4 +157,4 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return sorted([*__all__, "extend"])

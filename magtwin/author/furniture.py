@@ -16,7 +16,7 @@ from magtwin.files.settings import refused_at
 from magtwin.frames import IDENTITY_XYZW, quat_from_yaw, rotate
 from magtwin.spec.base import ZERO3, Quat, Spec, Vec3
 from magtwin.spec.furniture import BODY, FurnitureSpec, Part
-from magtwin.spec.lab import LabSpec
+from magtwin.spec.lab import LabSpec, beyond_m
 from magtwin.urdf.meshes.mesh import read_mesh
 from magtwin.usd.attributes import check_prim_name
 
@@ -199,6 +199,12 @@ def check_stands(piece: FurnitureSpec, lab: LabSpec) -> None:
             f"p_world of {piece.name!r} is ({x:g}, {y:g}): it reaches {beyond:.2f} m beyond the slab, "
             f"which is {2 * half[0]:g} x {2 * half[1]:g} m about {about}; move it, or enlarge {floor} or "
             f"apron_m of [lab]{hint}"
+        )
+    off = float(beyond_m(world[:, :2], lab.corners).max()) if lab.floor else 0.0
+    if off > lab.wall_thickness_m + lab.apron_m + 1e-6:
+        raise InputError(
+            f"p_world of {piece.name!r} is ({piece.p_world[0]:g}, {piece.p_world[1]:g}): it reaches "
+            f"{off:.2f} m off the floor, whose corners leave that place out; move it, or change floor"
         )
 
 

@@ -309,7 +309,8 @@ class Room(Summarized):
             InputError: A value has the wrong type or size.
         """
         values: dict[str, Any] = {"name": self._free("source", "magnet"), **more, "p_world": _place(at)}
-        if any(plain(m_world)):
+        moment = plain(m_world)
+        if not isinstance(moment, list) or any(moment):
             values["m_world"] = m_world
         elif not {"magnetization", "susceptibility"} & set(more):
             raise InputError(

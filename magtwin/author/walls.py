@@ -1,15 +1,18 @@
 """Walls, doors and windows of a scene's TOML, their default magnetization, and what stands in them."""
 
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
+import numpy as np
+
 from magtwin.author.furniture import drawn_magnetization
-from magtwin.errors import InputError
+from magtwin.errors import InputError, MismatchWarning
 from magtwin.files.settings import refused_at
 from magtwin.spec.furniture import BODY, MATERIALS, FurnitureSpec, Part
-from magtwin.spec.lab import LabSpec
+from magtwin.spec.lab import LabSpec, off_floor_m
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.walls import NO_LEAF, Door, Structure, Wall, Window, overlap_m
 from magtwin.usd.lab.furniture import FURNITURE
@@ -90,19 +93,32 @@ def lab_with_walls(
     """As `with_walls`, of the tables of a TOML `path`.
 
     Raises:
-        InputError: As there; the text has file and line.
+        InputError: As there, or a wall stands off the floor; the text has file and line.
     """
     if not (walls or doors or windows):
         return lab
     for section, number, key, text in Structure.named(walls, doors, windows, lab.sides).faults():
         raise refused_at(path, key, text, section=section, number=number)
-    return with_walls(lab, walls, doors, windows, seed=seed)
+    made = with_walls(lab, walls, doors, windows, seed=seed)
+    for number, wall in enumerate(made.walls):
+        p_xy, beyond = off_floor_m(wall, lab)
+        x, y = p_xy[beyond.argmax()]
+        floor = "floor" if lab.floor else "floor_m"
+        text = f"end it at the floor's border, or enlarge {floor} of [lab]"
+        text = f"reaches {beyond.max():.2f} m off the floor at ({x:.2f}, {y:.2f}); {text}"
+        if beyond.min() > 0:
+            text = f"wall {wall.name!r} stands off the floor and {text}"
+            raise refused_at(path, "from", text, section="wall", number=number)
+        if beyond.max() > 0:
+            warnings.warn(f"{path}: wall {wall.name!r} {text}", MismatchWarning, stacklevel=2)
+    return made
 
 
 def check_not_in_walls(
     pieces: Sequence[FurnitureSpec], lab: LabSpec, obstacles: Obstacles, path: str | os.PathLike[str]
 ) -> None:
-    """Refuse furniture that stands in a wall or in the leaf of a door.
+    """Refuse furniture that stands in a wall, in the leaf of a door, or through a side of a floor with
+    corners. Warn of a piece that stands through a side of a rectangle.
 
     Args:
         pieces: Furniture, in the order of its tables in `path`.
@@ -113,25 +129,29 @@ def check_not_in_walls(
     Raises:
         InputError: A piece does; the text has its line, the wall and the depth.
     """
-    if not lab.walls:
-        return
     placed = list(zip(obstacles.names, obstacles.outlines, strict=True))
     own = {wall.name for wall in lab.walls}
-    walls = [(name, o) for name, o in placed if name.startswith(f"{WALLS}/") and name.split("/")[4] in own]
+    walls = [(name.split("/")[4:], outline) for name, outline in placed if name.startswith(f"{WALLS}/")]
     numbers = {piece.name: number for number, piece in enumerate(pieces)}
+    parts: dict[str, list[np.ndarray]] = {}
     for name, outline in placed:
-        if not name.startswith(f"{FURNITURE}/"):
-            continue
-        piece = name.split("/")[3]
+        if name.startswith(f"{FURNITURE}/"):
+            parts.setdefault(name.split("/")[3], []).append(outline)
+    for piece, outlines in parts.items():
+        whole = Obstacles((piece,), (np.concatenate(outlines),)).outlines  # a table's legs are beside a side
         for wall_name, wall in walls:
-            if (deep := overlap_m(outline, wall)) > IN_WALL_M:
-                parts = wall_name.split("/")[4:]
-                what = f"door {parts[1]!r}" if parts[-1] == "leaf" else f"wall {parts[0]!r}"
-                x, y = outline.mean(axis=0)
-                text = (
-                    f"{piece!r} stands {deep:.2f} m deep in {what} at ({x:.2f}, {y:.2f}); move it, or end "
-                    "the wall there"
-                )
-                if piece not in numbers:
-                    raise InputError(f"{path}: {text}")
+            inner = wall_name[0] in own
+            depths = [(overlap_m(outline, wall), outline) for outline in (outlines if inner else whole)]
+            deep, outline = max(depths, key=lambda each: each[0])
+            if deep <= IN_WALL_M:
+                continue
+            what = f"door {wall_name[1]!r}" if wall_name[-1] == "leaf" else f"wall {wall_name[0]!r}"
+            x, y = outline.mean(axis=0)
+            text = f"{piece!r} stands {deep:.2f} m deep in {what} at ({x:.2f}, {y:.2f}); move it"
+            text += ", or end the wall there" if inner else " onto the floor"
+            if not (inner or lab.floor):
+                warnings.warn(f"{path}: {text}", MismatchWarning, stacklevel=2)
+            elif piece not in numbers:
+                raise InputError(f"{path}: {text}")
+            else:
                 raise refused_at(path, "p_world", text, section="furniture", number=numbers[piece])

@@ -1,5 +1,6 @@
 """Runs: the path on the floor and what the map lacks along it; or the path alone, for a page."""
 
+import textwrap
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,6 +53,9 @@ MOST_OTHER = 4
 TRAIL_SHARE = 0.995
 """Share of the readings within the scale of a trail; its ends take the rest."""
 
+LETTER_IN = 0.085
+"""Width of a letter of a title, with some room [inch]."""
+
 DASHES: dict[str, Any] = {"ls": (0, (6, 1.2))}
 
 
@@ -87,7 +91,8 @@ def draw_run(
         if not len(_places(run, place)):
             raise InputError(f"no position is known in {place!r} of the run")
         draw_path(sides[0].subplots(), run, place, field, planned, plan)
-    sides[0].suptitle(_title(run, place), x=0.02, ha="left")
+    title = textwrap.fill(_title(run, place), int(sides[0].bbox.width / figure.dpi / LETTER_IN))
+    sides[0].suptitle(title, x=0.02, ha="left")
     if panels:
         heights = [panel.height for panel in panels]
         axes = sides[-1].subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]

@@ -319,6 +319,8 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
                 _from_table(a, v, where.inside(key, k))
                 for k, (a, v) in enumerate(zip(args, value, strict=True))
             )
+        if set(args) == {float} and any(isinstance(v, str) for v in value):
+            raise wrong()
         return tuple(_value(a, v, where, key) for a, v in zip(args, value, strict=True))
     if origin is typing.Literal:
         if value not in args:

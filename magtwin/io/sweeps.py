@@ -27,6 +27,7 @@ from magtwin.run.run import Run
 from magtwin.version import __version__
 
 LISTING = "runs.csv"
+SCENE = ("scene", "scene_name")
 LISTED = ("path", "seed", "session", "speed_m_s")
 ABOUT = "sweep.json"
 
@@ -45,10 +46,11 @@ class Listed:
     driven_s: float = 0.0
     tally: Tally = field(default_factory=Tally)
 
-    def add(self, name: str, run: Run) -> None:
-        """Add a run."""
+    def add(self, name: str, run: Run, scene: int | None = None) -> None:
+        """Add a run, of the scene of that number if there are several."""
         run.add_to(self.tally)
-        self.rows.append([name, *(run.metadata.get(key, "") for key in LISTED), run.rows])
+        of = [] if scene is None else [scene, run.metadata.get("scene", "")]
+        self.rows.append([name, *of, *(run.metadata.get(key, "") for key in LISTED), run.rows])
         self.paths[str(run.metadata.get("path", ""))] = None
         session, seed = (str(run.metadata.get(key)) for key in ("session", "session_seed"))
         self.sessions[f"{session} {seed}"] = session
@@ -76,7 +78,8 @@ class Listed:
         """The file runs.csv."""
         file = io.StringIO(newline="")
         table: Any = csv.writer(file, lineterminator="\n")
-        table.writerow(("file", *LISTED, "readings"))
+        several = bool(self.rows) and len(self.rows[0]) > len(LISTED) + 2
+        table.writerow(("file", *(SCENE if several else ()), *LISTED, "readings"))
         table.writerows(self.rows)
         return file.getvalue().encode()
 
@@ -117,7 +120,8 @@ def save_runs(
 ) -> Report:
     """Write runs to a folder: run_00000.parquet and so on, and runs.csv.
 
-    runs.csv has a row per run with file, path, seed, session, speed_m_s and readings. The files are the same
+    runs.csv has a row per run with file, path, seed, session, speed_m_s and readings; of a sweep over several
+    scenes also `scene`, its number from 0, and scene_name. The files are the same
     with any number of jobs and shards. With jobs, shards or dask, unfinished work is kept in the folder
     OUT.parts, and a repeat continues it.
 
@@ -157,13 +161,14 @@ def save_runs(
 def _save_here(runs: Sequence[Run], out: str | os.PathLike[str], force: bool, progress: Progress) -> Report:
     """Make runs in this process and write them."""
     said, start = Listed(), time.monotonic()
+    scene_of = getattr(runs, "scene_of", lambda number: None)
     with output(out, force=force) as folder:
         folder.mkdir()
         progress(0, len(runs))
         for k, run in enumerate(runs):
             name = _file(k)
             write_parquet(run, folder / name)
-            said.add(name, run)
+            said.add(name, run, scene_of(k))
             progress(k + 1, len(runs))
         (folder / LISTING).write_bytes(said.csv())
     return said.report(f"{len(runs)} runs in {out}", time.monotonic() - start, len(runs))
@@ -184,7 +189,7 @@ def make_block(runs: Any, folder: Path | None, numbers: range) -> tuple[list[tup
             files.append((_file(number), parquet_of(run)))
         else:
             write_parquet(run, folder / _file(number), force=True)
-        said.add(_file(number), run)
+        said.add(_file(number), run, runs.scene_of(number))
     return files, said
 
 

@@ -15,6 +15,9 @@ from magtwin.spec.walls import SAME_M, Door, Structure, Wall, Window, steel_of_w
 
 DEFAULT_FLOOR_M = (6.0, 3.5)
 
+STEP_M = 0.05
+"""Steps along a wall at which it is seen whether it is on the floor [m]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class LabSpec(Spec):
@@ -146,6 +149,28 @@ def on_polygon(p_xy: NDArray[np.float64], corners: Sequence[Vec2]) -> NDArray[np
         away = ((x - x0) * (y1 - y0) - (y - y0) * (x1 - x0)) / size
         border |= (np.abs(away) < SAME_M) & (along > -SAME_M) & (along < size + SAME_M)
     return inside | border
+
+
+def beyond_m(p_xy: NDArray[np.float64], corners: Sequence[Vec2]) -> NDArray[np.float64]:
+    """Distance of points (N, 2) from a polygon [m], 0 in it, shape (N,)."""
+    ends = np.array(corners, float)
+    side = np.roll(ends, -1, axis=0) - ends
+    to = p_xy[:, None] - ends
+    along = np.clip((to * side).sum(axis=2) / (side**2).sum(axis=1), 0, 1)
+    away = np.hypot(*np.moveaxis(to - along[..., None] * side, 2, 0)).min(axis=1)
+    return np.where(on_polygon(p_xy, corners), 0.0, away)
+
+
+def off_floor_m(wall: Wall, lab: LabSpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Points along a wall in world, shape (N, 2), and how far each is off the floor, shape (N,) [m].
+
+    A wall that stands around the floor, on the slab, is not off it.
+    """
+    far = np.linspace(0, wall.length_m, max(3, int(wall.length_m / STEP_M)))
+    p_xy = np.array([wall.at(float(s), 0.0) for s in far])
+    off = beyond_m(p_xy, lab.corners)
+    slab = lab.wall_thickness_m + lab.apron_m + wall.thickness_m / 2 + SAME_M
+    return p_xy, np.where(off > slab, off, 0.0)
 
 
 @lru_cache(maxsize=64)

@@ -1,6 +1,7 @@
 """Simulate: a twin and a path become a Run."""
 
 import importlib
+import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Literal
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from magtwin.errors import InputError, find
+from magtwin.errors import InputError, MismatchWarning, find
 from magtwin.path import Path
 from magtwin.report.verdict import OWN
 from magtwin.run.run import Run
@@ -111,6 +112,10 @@ def simulate(
 
     seed = checked_seed(seed)
     twin = opened(twin, network, magnetometer, model_error, "simulate")
+    if twin.scene.others:
+        first, *others = (repr(placed.robot.name) for placed in twin.scene.robots)
+        text = f"simulate drives {first} alone, without {', '.join(others)}; simulate_robots drives all"
+        warnings.warn(text, MismatchWarning, stacklevel=2)
     twin = in_session(with_plant(twin, plant), session, seed=seed)
     check_field(twin.scene, twin.field)
     path = drive_input(path, room_of(twin))

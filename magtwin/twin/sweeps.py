@@ -86,7 +86,9 @@ def sweep(
 
     Args:
         twin: An opened twin, or a scene as for `open_twin`; or several of them, taken in turn, such as
-            variants that `Scene.with_` gives. A `Scene` among several is opened without writing its stage.
+            variants that `Scene.with_` gives. A `Scene` among several is opened without writing its stage. Of
+            n scenes, run k has number k modulo n, which `runs.csv` lists, and the seed `seed` + k: scenes do
+            not share seeds unless `seeds` says so, such as `[7] * n`.
         paths: What to drive, as for `simulate`: one for all runs, or several, taken in turn. Default:
             `magtwin.twin.MIXTURE`.
         seeds: A seed for each run; or the number of runs, whose seeds then are `seed`, `seed` + 1, ...
@@ -164,7 +166,8 @@ def sweep(
         if id(own.scene) not in known:
             known[id(own.scene)] = own, scene_sha256(own.scene)
         check_commands(path, base.magnetometer)
-        jobs.append(Job(own.scene, path, number, speed, rooms[id(base)]))
+        place = k % len(bases) if len(bases) > 1 else None
+        jobs.append(Job(own.scene, path, number, speed, rooms[id(base)], place))
     finish = _Finish(tuple(known.values()), duration_s)
     if block is None:  # fewer runs at a time if they are longer than 10 minutes
         block = max(1, min(BLOCK, int(BLOCK * 600 / (duration_s or 600))))

@@ -149,12 +149,12 @@ def test_each_call_leaves_the_room_as_it_was():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda room: mt.Room("6", 4), "floor_m must be a number, got '6'"),
+        (lambda room: mt.Room("6", 4), "floor_m must be a list of 2, each a number, got .'6'"),
         (lambda room: mt.Room(6000, 4000), "must be in metres"),
         (lambda room: mt.Room(6, 4, wall_hight_m=1), "did you mean 'wall_height_m'"),
         (lambda room: mt.Room(6, floor=[(0, 0), (1, 0), (1, 1)]), "leave out x_m"),
         (lambda room: room.shelf((2500, 0)), "beyond the slab.*lengths are in metres"),
-        (lambda room: room.shelf(("1", "2")), "p_world must be a number, got '1'"),
+        (lambda room: room.shelf(("1", "2")), "p_world must be a list of 3, each a number, got .'1'"),
         (lambda room: room.shelf(3), r"at must be x and y"),
         (lambda room: room.shelf((1, 1), yaw=90), "in radians.*90 deg are 1.5708"),
         (lambda room: room.furniture("shelv", (1, 1)), "did you mean 'shelf'"),
@@ -167,6 +167,8 @@ def test_each_call_leaves_the_room_as_it_was():
         (lambda room: room.wall((0, -2), (0, 2)).door(2).wall((-1, 0), (1, 0)), "crosses 'door_0'"),
         (lambda room: room.wall((0, -2), (0, 2)).shelf((0, 0)).robot(at=(2, 0)).scene, "deep in wall"),
         (lambda room: room.magnet((0, 0)), "needs m_world"),
+        (lambda room: room.magnet((0, 0), m_world=5), "m_world must be a list of 3, each a number, got 5"),
+        (lambda room: room.wall((4, 0), (5, 0)), r"stands off the floor .* 2.00 m .* at \(5.00, 0.00\)"),
         (lambda room: room.earth(100, 0), "latitude_deg"),
         (lambda room: room.survey(spacing=1), "did you mean 'spacing_m'"),
         (lambda room: room.robot("turtelbot4"), "no robot 'turtelbot4'; known: turtlebot4"),
@@ -246,8 +248,17 @@ def test_a_sweep_of_scenes_equals_single_runs_and_tells_of_stale_maps(room, tmp_
         assert ("map_mismatch" in made[k].metadata) == (k < 4)
     assert made[0]["b_total_nt"].tobytes() == runs[0]["b_total_nt"].tobytes()
     assert made[0].metadata["map_mismatch"].endswith("with_(map_layer=magtwin.survey(scene))")
-    report = runs.save(tmp_path / "runs", jobs=2)
-    assert "runs" in str(report)
+    assert "runs" in str(runs.save(tmp_path / "runs", jobs=2))
+    runs.save(tmp_path / "again")
+    listed = [(tmp_path / name / "runs.csv").read_text().splitlines() for name in ("runs", "again")]
+    assert listed[0] == listed[1]
+    assert listed[0][0] == "file,scene,scene_name,path,seed,session,speed_m_s,readings"
+    assert [line.split(",")[1:3] for line in listed[0][1:]] == [[str(k), "den"] for k in range(5)]
+
+
+def test_simulate_warns_of_the_robots_that_it_leaves_out(room):
+    with pytest.warns(MismatchWarning, match="drives 'turtlebot4' alone, without 'second'; simulate_robots"):
+        mt.simulate(room, [(-2, -1.5), (-0.5, -1.5)], duration_s=1.0, rate_hz=5.0)
 
 
 def test_the_page_author_in_python_runs_from_an_empty_folder(tmp_path, monkeypatch):

@@ -82,13 +82,13 @@ def lab_room(lab: LabSpec, radius: float = 0.171) -> Room:
     return Room(lab.floor_m, radius, obstacles_in(lab, ()), lab.border)
 
 
-def test_a_stage_of_walls_reads_back_as_its_toml_and_is_valid(l_room):
+def test_a_stage_of_walls_reads_back_as_its_toml_and_is_valid(l_room, tmp_path):
     scene, stage = l_room
     opened = open_scene(stage)
     assert opened.scene.lab == scene.lab
     assert opened.scene.magnets == scene.magnets
     assert opened.changes == ()
-    assert_valid(stage)
+    assert_valid(stage, tmp_path)
 
 
 def test_every_key_of_walls_doors_and_windows_goes_into_the_stage_and_back(tmp_path):
@@ -264,6 +264,7 @@ def test_default_magnetization_is_that_of_steel_in_the_wall():
 
 
 WALL = '[[wall]]\nname = "a"\nfrom = [0, 1]\nto = [4, 1]\n'
+SHELF = '[[furniture]]\nname = "shelf"\nkind = "shelf"\np_world = [{}, {}, 0]\n'
 DOOR = '[[door]]\nwall = "a"\nat_m = 2\n'
 
 
@@ -314,11 +315,19 @@ DOOR = '[[door]]\nwall = "a"\nat_m = 2\n'
         ),
         (
             "",
-            WALL + '[[furniture]]\nname = "shelf"\nkind = "shelf"\np_world = [1, 1.1, 0]\n',
+            WALL + SHELF.format(1, 1.1),
             "p_world",
             "'shelf' stands .* m deep in wall 'a'",
         ),
         ("", "[[window]]\nwall = 'a'\nat_m = 1\n", "wall", "the room has none|known: east"),
+        (
+            f"floor = {CORNERS}",
+            WALL.replace("[0, 1]", "[6, 4]").replace("4, 1", "8, 4"),
+            "from",
+            "off the floor",
+        ),
+        (f"floor = {CORNERS}", SHELF.format(7, 4), "p_world", "reaches 1.50 m off the floor, whose corners"),
+        (f"floor = {CORNERS}", SHELF.format(9, 1.5), "p_world", "0.05 m deep in wall 'edge_1'"),
     ],
 )
 def test_walls_that_cannot_be_are_refused_with_line_place_and_the_way_on(tmp_path, lab, more, line, said):
@@ -332,6 +341,15 @@ def test_walls_that_cannot_be_are_refused_with_line_place_and_the_way_on(tmp_pat
         scene_from_toml(file)
     number = int(str(refusal.value).split(":")[1])
     assert file.read_text(encoding="utf-8").splitlines()[number - 1].startswith(line)
+
+
+def test_what_stands_through_a_side_of_a_rectangle_is_told(tmp_path):
+    text = L_ROOM.split("lab = ")[0] + L_ROOM[L_ROOM.index("earth") : L_ROOM.index("wall = ")]
+    file = written(tmp_path, text + WALL + SHELF.format(-3, 0))
+    with pytest.warns(MismatchWarning) as told:
+        scene_from_toml(file)
+    assert "'shelf' stands 0.05 m deep in wall 'West'" in str(told[-1].message)
+    assert "wall 'a' reaches 1.00 m off the floor at (4.00, 1.00); end it" in str(told[0].message)
 
 
 def test_a_path_through_a_closed_room_is_refused_with_the_wall(l_room):

@@ -17,7 +17,7 @@ from magtwin.author.plan.grid import read_grid
 from magtwin.author.plan.svg import read_svg
 from magtwin.errors import InputError
 from magtwin.files.file import existing
-from magtwin.spec.lab import LabSpec
+from magtwin.spec.lab import LabSpec, off_floor_m
 from magtwin.spec.walls import Door, Structure, Wall, Window, corners_of
 
 READERS: Mapping[str, Callable[[Path], Drawing]] = MappingProxyType(
@@ -90,6 +90,11 @@ def plan_toml(path: Path, name: str, scale: float | None = None) -> tuple[str, l
         lab = LabSpec(**plan.lab)  # type: ignore[arg-type]
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    off = {wall.name for wall in plan.walls if off_floor_m(wall, lab)[1].min() > 0}
+    if off:
+        plan.notes.append(f"{len(off)} lines left out that stand off the floor")
+        plan.walls = [wall for wall in plan.walls if wall.name not in off]
+        plan.openings = [each for each in plan.openings if each.wall not in off]
     doors = [each for each in plan.openings if isinstance(each, Door)]
     windows = [each for each in plan.openings if isinstance(each, Window)]
     for _, _, _, text in Structure.named(plan.walls, doors, windows, lab.sides).faults():

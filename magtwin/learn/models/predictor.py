@@ -284,7 +284,7 @@ def load_predictor(path: str | os.PathLike[str], *, module: Any = None) -> Predi
     """Load a predictor of any kind: magtwin's safetensors, or a released `.pth`.
 
     A file of your own torch module holds its numbers and the name of its class, and no code. Its class must
-    be given, have been trained in this process, or be registered (`magtwin.extend.network`).
+    be given once in this process, have been trained in it, or be registered (`magtwin.extend.network`).
 
     Args:
         path: The weights.

@@ -8,7 +8,7 @@ The module gets standardised features and gives the standardised disturbance:
 
 The loss of the first kind is the mean square, of the second the negative log-likelihood of a normal law.
 A weights file holds the module's numbers and the name of its class. Code is never loaded from a file: the
-class is given, was trained in this process, or is registered with `magtwin.extend.network`.
+class is given once in this process, was trained in it, or is registered with `magtwin.extend.network`.
 """
 
 import copy
@@ -39,7 +39,7 @@ WIDEST = 8.0
 """Largest size of the logarithm of a standardised standard deviation."""
 
 _TRAINED: dict[str, Any] = {}
-"""Classes that were trained in this process, and copies of instances, by name."""
+"""Classes that were trained or given in this process, and copies of instances, by name."""
 
 Net = torch.nn.Module
 Make = Callable[..., Net]
@@ -185,6 +185,7 @@ class Modules:
         state = weights.fit({**scaler_tensors(count), "y_mean": np.ones(()), "y_scale": np.ones(()), **like})
         held = {key: torch.from_numpy(value.copy()) for key, value in tensors_below(state, "net.").items()}
         net.load_state_dict({key: held[key] for key in net.state_dict()})
+        _remember(name, given)
         inputs = inputs_from(weights.features, state, path)
         if not state["y_scale"] > 0:
             raise InputError(f"{path}: the scale of its labels is not above 0")

@@ -54,6 +54,9 @@ class Job:
     conditions: Conditions
     """Map, obstacles and options."""
 
+    place: int | None = None
+    """Number of its scene among several, from 0. None if all runs have one."""
+
 
 class Finish(Protocol):
     """From jobs and their sensed runs to whole runs: where a network predicts, for all rows at once."""
@@ -117,6 +120,10 @@ class Runs(Summarized, Sequence[Run]):
         if self._steps >= LOOPS.pays:
             with suppress(ImportError):  # plain Python gives the same bytes
                 warm_up()
+
+    def scene_of(self, index: int) -> int | None:
+        """Number of a run's scene among those of the sweep, from 0. None if there is one."""
+        return self._jobs[index].place
 
     def __len__(self) -> int:
         return len(self._jobs)

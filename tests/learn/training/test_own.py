@@ -1,5 +1,6 @@
 """Own torch modules: trained, saved, loaded, judged and run in a twin; and what is wrong with one."""
 
+import inspect
 import subprocess
 import sys
 
@@ -76,6 +77,24 @@ def test_an_affine_module_comes_as_near_as_least_squares(folder):
     linear = mt.train(folder / "set", model="linear", features="circular", penalty=0.0, weighting="none")
     assert module.history[-1].train_rmse_nt < 1.1 * linear.predictor.metadata["label_sd_nt"]
     assert module.parts[0].rmse_nt < 1.2 * linear.parts[0].rmse_nt
+
+
+def test_a_module_of_another_program_drives_a_room_once_its_class_is_given(folder, trained):
+    program = f"""
+import inspect, torch, numpy as np, magtwin as mt
+{inspect.getsource(Small)}
+loaded = mt.load_predictor({str(folder / "small.safetensors")!r}, module=Small)
+room = mt.Room(4, 3).survey(spacing_m=1.5, headings_deg=[0], readings=2).shelf((1.5, 0.5)).robot()
+given = dict(network=loaded, duration_s=1)
+run, swept = mt.simulate(room, "figure8", **given), mt.sweep(room, "figure8", 1, **given)[0]
+assert run["b_total_nt"].tobytes() == swept["b_total_nt"].tobytes()
+assert mt.open_twin(room, network=loaded).magnetometer.name == "Small.safetensors"
+assert mt.extend.network("my:Small")(Small) is Small
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=False
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_file_executes_nothing_and_its_class_is_given_or_registered(folder, trained):
