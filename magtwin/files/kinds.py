@@ -188,7 +188,7 @@ def scene_file(scene: str | Path) -> Path:
 
 
 def stage_in(folder: Path) -> Path:
-    """The stage of a folder: the one of its name; in a folder that was renamed, the one with a layer of its own.
+    """The stage of a folder: the one of its name; in a folder that was renamed, the one with its own layer.
 
     A scene NAME is NAME.usda beside NAME_layer.usda; a robot is the only stage of its folder.
     """
