@@ -12,13 +12,13 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 
 REACH = {
-    "read_survey": ("magtwin.io.surveys.survey", 7_100),
-    "fit_map": ("magtwin.field.fit.fit", 3_800),
-    "simulate": ("magtwin.twin.simulation", 16_400),
-    "open_twin": ("magtwin.twin.opening", 18_500),
-    "localize": ("magtwin.tasks.localizing", 17_800),
-    "from_urdf": ("magtwin.author.from_urdf", 11_200),
-    "ros magnetometer": ("magtwin.ros.magnetometer", 13_500),
+    "read_survey": ("magtwin.io.surveys.survey", 8_100),
+    "fit_map": ("magtwin.field.fit.fit", 3_900),
+    "simulate": ("magtwin.twin.simulation", 17_900),
+    "open_twin": ("magtwin.twin.opening", 20_000),
+    "localize": ("magtwin.tasks.localizing", 18_300),
+    "from_urdf": ("magtwin.author.from_urdf", 11_400),
+    "ros magnetometer": ("magtwin.ros.magnetometer", 14_200),
 }
 """Module of a public function, and the most lines of magtwin that it reaches.
 
@@ -27,34 +27,34 @@ that a table names as text, since these are loaded for one format or method only
 """
 
 ROOMS = {
-    "magtwin": 1_160,
-    "author": 1_620,
+    "magtwin": 1_210,
+    "author": 3_600,
     "bench": 3_220,
-    "cli": 4_700,
+    "cli": 4_920,
     "export": 3_540,
     "fetch": 160,
-    "field": 9_040,
-    "files": 1_470,
-    "figures": 3_890,
-    "io": 9_110,
-    "learn": 8_830,
+    "field": 9_190,
+    "files": 1_690,
+    "figures": 4_830,
+    "io": 10_580,
+    "learn": 9_290,
     "localization": 5_990,
-    "parallel": 910,
-    "path": 1_000,
-    "report": 410,
+    "parallel": 930,
+    "path": 1_420,
+    "report": 460,
     "ros": 4_320,
-    "run": 1_650,
-    "sim": 8_330,
-    "spec": 1_710,
+    "run": 1_700,
+    "sim": 8_340,
+    "spec": 2_460,
     "tables": 1_250,
     "tasks": 1_100,
-    "twin": 1_800,
+    "twin": 2_190,
     "urdf": 10_590,
-    "usd": 6_120,
+    "usd": 6_400,
 }
 """Most lines of each room; "magtwin" are the files beside the rooms."""
 
-TESTS = 45_400
+TESTS = 48_100
 """Most lines of tests."""
 
 LONG = 80
