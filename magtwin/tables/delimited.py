@@ -303,8 +303,10 @@ def _decoded(path: Path, content: bytes, noun: str, notes: list[str]) -> str:
     encoding = "utf-8-sig"
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         encoding = "utf-16"
-    elif 3 * head.count(0) > len(head):  # one byte of two in plain letters
-        encoding = "utf-16-le" if head[1::2].count(0) > head[::2].count(0) else "utf-16-be"
+    else:  # plain letters in UTF-16 have a byte of 0 each
+        even, odd = head[::2].count(0), head[1::2].count(0)
+        if len(head) > 8 and 3 * max(even, odd) > len(head) and not min(even, odd):
+            encoding = "utf-16-le" if odd else "utf-16-be"
     try:
         text = content.decode(encoding)
     except UnicodeDecodeError:
