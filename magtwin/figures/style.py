@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-from cycler import cycler
+from matplotlib.rcsetup import cycler
 from matplotlib import rc_context
 
 P = ParamSpec("P")
