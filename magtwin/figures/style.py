@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-from matplotlib.rcsetup import cycler
 from matplotlib import rc_context
+from matplotlib.rcsetup import cycler
 
 P = ParamSpec("P")
 R = TypeVar("R")

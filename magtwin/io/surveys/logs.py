@@ -125,7 +125,9 @@ def _zipped(path: Path) -> Parts:
                 if (table := _read(path / inside.name, content)) is not None:
                     parts[inside.stem] = table
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError) as error:
-        raise InputError(f"{path}: no archive of tables, or damaged ({str(error)[:100]}); unpack it") from None
+        raise InputError(
+            f"{path}: no archive of tables, or damaged ({str(error)[:100]}); unpack it"
+        ) from None
     return parts
 
 
