@@ -291,8 +291,8 @@ def test_the_starter_works_as_it_stands(tmp_path, monkeypatch, capsys):
     main(["scene", "attic.toml", "--out", "attic"])
     run = simulate("attic/attic.usda", "figure8", duration_s=5.0, rate_hz=10.0)
     assert np.isfinite(run["b_total_nt"]).all()
-    with pytest.raises(InputError, match=r"attic\.toml: exists already; give `force=True`"):
-        main(["new", "attic.toml", "--debug"])
+    main(["new", "attic.toml"])
+    assert (tmp_path / "attic-1.toml").is_file()
     with pytest.raises(InputError, match=r"ends in \.toml"):
         main(["new", "attic.txt", "--debug"])
 

@@ -20,6 +20,7 @@ from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import PlacedRobot, RobotSpec
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec
+from magtwin.spec.walls import Door, Wall, Window
 from magtwin.usd import schema
 from magtwin.usd.attributes import plain_value, write_pose
 from magtwin.usd.schema import attribute_name, generate
@@ -37,6 +38,9 @@ SPECS = {
     "platform": PlatformFieldSpec,
     "lab": LabSpec,
     "harmonic": HarmonicField,
+    "wall": Wall,
+    "door": Door,
+    "window": Window,
 }
 """The spec whose figures each noun's attributes hold."""
 
@@ -80,6 +84,7 @@ def other_value(attribute: Usd.Attribute):
         "bool[]": Vt.BoolArray([True, False]),
         "float[]": Vt.FloatArray([1.5]),
         "double[]": Vt.DoubleArray([1.5]),
+        "double2[]": Vt.Vec2dArray([Gf.Vec2d(1, 2)]),
         "double3[]": Vt.Vec3dArray([Gf.Vec3d(1, 2, 3)]),
         "double4[]": Vt.Vec4dArray([Gf.Vec4d(1, 2, 3, 4)]),
         "int": 7,
@@ -158,6 +163,15 @@ UNAUTHORED = {
     "magtwin:robot:path": ("", PlacedRobot.__dataclass_fields__["path"].default),
     "magtwin:robot:pathFile": (None, None),
     "magtwin:source:momentAm2": (ZERO3, SourceSpec.__dataclass_fields__["m_world"].default),
+    "magtwin:wall:startM": ((0.0, 0.0), (0.0, 0.0)),
+    "magtwin:wall:endM": ((1.0, 0.0), (1.0, 0.0)),
+    "magtwin:door:atM": (0.5, 0.5),
+    "magtwin:window:atM": (0.5, 0.5),
+    **{
+        f"magtwin:{noun}:{name}": (0.0, 0.0)
+        for noun in ("wall", "door")
+        for name in ("magnetizationAPerM", "susceptibility")
+    },
     **{
         attribute_name("furniture", name): (default, FurnitureSpec.__dataclass_fields__[name].default)
         for name, default in (("material", ""), ("size_m", ZERO3))
