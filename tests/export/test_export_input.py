@@ -248,7 +248,7 @@ def test_the_command_exports_a_scene_by_its_name_and_says_what_it_made_as_json(t
 
 
 @pytest.mark.parametrize(
-    ("scene", "text"), [("lap", "did you mean 'lab'"), ("lab.toml", "magtwin scene lab.toml --out FOLDER")]
+    ("scene", "text"), [("lap", "did you mean 'lab'"), ("lab.toml", "magtwin scene lab.toml --out lab")]
 )
 def test_the_command_refuses_what_is_no_stage_with_status_1(scene, text, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:

@@ -140,7 +140,7 @@ def test_a_node_is_the_mean_of_its_good_readings_and_not_valid_without_any(tmp_p
 
 
 def test_readings_that_stand_on_no_grid_make_no_nodes():
-    with pytest.raises(InputError, match=r"survey 'mow' is not gridded.*magtwin map fit"):
+    with pytest.raises(InputError, match=r"survey 'mow' is not gridded.*fit_map"):
         node_map(Readings(p_xy=[[0, 0]], yaw=[0], b_nt=[41_000], name="mow"))
 
 
