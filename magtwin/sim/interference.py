@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from functools import lru_cache
 
@@ -393,8 +394,10 @@ def platforms_of_rows(platforms: Sequence[PlatformFieldSpec]) -> PlatformFieldSp
     Returns:
         The first platform, with arrays of a row or number per robot for the figures in `DRAWN`.
     """
-    rows = {name: np.array([getattr(one, name) for one in platforms]) for name in DRAWN}
-    return replace(platforms[0], **rows)  # type: ignore[arg-type]
+    several = copy(platforms[0])  # its checks are for one robot
+    for name in DRAWN:
+        object.__setattr__(several, name, np.array([getattr(one, name) for one in platforms]))
+    return several
 
 
 def torques_nm(robot: RobotSpec, motion: Moving, t: Array, true: Moment) -> Array:
