@@ -119,7 +119,7 @@ def test_info_tells_of_every_recording_and_reads_every_shard(made, capsys):
     main(["dataset", "info", str(made), "--json"])
     told = json.loads(capsys.readouterr().out)
     assert list(told["metadata"]["recordings"]) == ["c", "monday_a", "b", "tuesday_a"]
-    assert told["metadata"]["feature sets"] == "full, correlated"
+    assert told["metadata"]["feature_sets"] == "full, correlated"
     assert told["figures"]["labels"] == 320
 
 

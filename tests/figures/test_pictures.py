@@ -180,8 +180,8 @@ def test_furniture_is_seen_and_whole_in_rooms_with_high_walls(name, tmp_path, mo
     def is_furniture(shape):
         return "/Furniture/" in shape.prim and "box_" not in shape.prim
 
-    def coloured(shape, vertices, of=pictures.mesh_of):
-        mesh = of(shape, vertices)
+    def coloured(shape, vertices, of=pictures.mesh_of, **how):
+        mesh = of(shape, vertices, **how)
         mesh["rgb"] = np.tile(
             np.uint8([255, 0, 0] if is_furniture(shape) else [0, 255, 0]), (mesh.n_points, 1)
         )

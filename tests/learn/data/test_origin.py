@@ -160,7 +160,7 @@ def test_a_command_says_each_mismatch_once_on_stderr_and_info_shows_it(lab_scene
     main(["run", str(lab_scene), "--network", str(strange), "--duration-s", "1", "--out", str(out)])
     shown = capsys.readouterr()
     lines = [line for line in shown.err.splitlines() if "warning" in line]
-    assert len(lines) == 2
+    assert len(lines) == 3
     assert lines[0].startswith("magtwin: warning: WRONG ROBOT: strange.safetensors")
     assert "WRONG ROBOT" in shown.out
     main(["info", str(out / "run.parquet")])

@@ -208,7 +208,7 @@ def test_run_writes_a_file_for_each_robot_or_one_to_the_same_bits(two, tmp_path,
     monkeypatch.setenv("MAGTWIN_RUN_RATE_HZ", "20")
     main(["run", str(two), "--out", str(tmp_path / "r.parquet"), "--json"])
     report = json.loads(capsys.readouterr().out)
-    assert {"ann: duration", "bob: duration"} <= report["figures"].keys()
+    assert {"ann_duration_s", "bob_duration_s"} <= report["figures"].keys()
     assert sorted(file.name for file in tmp_path.iterdir()) == ["r.ann.parquet", "r.bob.parquet"]
     main(["run", str(two), "--robot", "bob", "--out", str(tmp_path / "one.parquet")])
     whole, one = read_parquet(tmp_path / "r.bob.parquet"), read_parquet(tmp_path / "one.parquet")
