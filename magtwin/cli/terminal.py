@@ -30,6 +30,9 @@ MOST_LINES, MOST_FIGURES, MOST_NOTES = 12, 5, 5
 ORIGIN = ("licences", "columns", "features", "inputs")
 """Lists of a report that only `magtwin info` prints, as it does those of checksums."""
 
+MISMATCH = "_mismatch"
+"""End of the names of facts that are always printed: the network or the map is that of another twin."""
+
 FLAG = "flag_"
 """Figures with this in their names count readings in doubt, and are printed in one line."""
 
@@ -102,6 +105,7 @@ class Done:
         report, named = self.report, {figure.name: figure for figure in self.report.figures}
         flags = [figure for figure in report.figures if FLAG in figure.name]
         lines = [_bold(report.title), *([_bold(report.verdict)] if report.verdict else [])]
+        wrong = [str(each) for name, each in report.metadata.items() if name.endswith(MISMATCH)]
         if self.whole:
             words = [
                 (name, str(each)) for name, each in report.metadata.items() if not isinstance(each, LISTS)
@@ -111,13 +115,13 @@ class Done:
         chosen = [named[name] for name in self.figures if name in named]
         if not self.figures:
             chosen = [figure for figure in report.figures if figure not in flags]
-        lines += _rows(chosen[:MOST_FIGURES], clip=True)
+        lines += [*map(printable, wrong), *_rows(chosen[:MOST_FIGURES], clip=True)]
         if flags:
             counts = ", ".join(f"{f.value:,} {f.name.replace(FLAG, '')}" for f in flags)
             lines.append(f"readings in doubt  {counts}")
         notes = [line for name, each in report.metadata.items() for line in _notes(name, each, brief=True)]
         facts = [each for each in report.metadata.values() if not isinstance(each, LISTS) and each != ""]
-        left = len(report.figures) - len(flags) - min(len(chosen), MOST_FIGURES) + len(facts)
+        left = len(report.figures) - len(flags) - min(len(chosen), MOST_FIGURES) + len(facts) - len(wrong)
         room = min(room - len(lines), MOST_NOTES + 2)
         return lines + _cut([*self.lines, *notes], room, self.rest, left if self.rest else 0)
 

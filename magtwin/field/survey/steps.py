@@ -39,8 +39,8 @@ def smooth_within_steps(values: Array) -> tuple[Array, float]:
     """
     from scipy.linalg import solveh_banded
 
-    step = _step(values)
-    if not step:
+    coarse = len(values) >= LEAST and np.mean(np.diff(values) == 0) >= REPEATED
+    if not (coarse and (step := step_of(values))):
         return values, 0.0
     n = len(values)
     bands = np.zeros((3, n))
@@ -57,13 +57,13 @@ def smooth_within_steps(values: Array) -> tuple[Array, float]:
     return np.clip(smooth, low, high), step
 
 
-def _step(values: Array) -> float:
-    """The step of a coarse sensor; 0 if it is not coarse."""
-    if len(values) < LEAST or np.mean(np.diff(values) == 0) < REPEATED:
-        return 0.0
-    gaps = np.diff(np.unique(values))
+def step_of(values: Array, share: float = 1.0) -> float:
+    """The step by whole numbers of which a share of the values, shape (N,), differ; 0 if there is none."""
+    gaps = np.diff(np.unique(np.round(values, 6)))
     if not len(gaps):
         return 0.0
     step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
     whole = (values - values[0]) / step
-    return step if np.abs(whole - np.round(whole)).max() < WHOLE else 0.0
+    size = 1e-6 * float(np.abs(values).max())  # of rounding in a text of seven digits
+    near = np.abs(whole - np.round(whole)) < WHOLE + size / step
+    return step if step > size and near.mean() >= share else 0.0

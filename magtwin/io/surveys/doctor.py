@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.field.survey.hold import LEAST_MEAN, held
 from magtwin.field.survey.readings import taken_of
+from magtwin.field.survey.steps import step_of
 from magtwin.field.units import INDOORS_NT
+from magtwin.io.surveys.columns import Columns
 from magtwin.report.report import Figure, Report
 
 Array = NDArray[np.float64]
@@ -21,7 +23,6 @@ FILTER_HZ = 5.0  # Rate at which the localizers read the field [Hz]
 SECTORS = 12  # Sectors of 30 degrees in which headings are counted
 LEAST_READINGS, LEAST_SPAN_M = 100, 0.5  # Fewest readings and least extent [m] of a map
 LEAST_SECTORS = 6  # Fewest sectors for the hard iron, and for a robot's own field
-STEPS = 0.02  # Largest distance from a whole number of steps, in steps, of a value that a sensor rounded
 
 USES = {
     "map": ("pose",),
@@ -86,30 +87,28 @@ def examine(
 def info_of_survey(file: Path) -> Report:
     """What the field in a table or a log is like, what it is fit for, and the command to type next."""
     from magtwin.io.surveys.logs import table_of_log
-    from magtwin.io.surveys.readings import read_readings
-    from magtwin.io.surveys.tabled import field_of_table
+    from magtwin.io.surveys.tabled import field_of_table, readings_of_table
 
     table = table_of_log(file)
     vector, b, t, unit = field_of_table(table)
     roles = [role for role, symbols in (("odometry", ("v", "w")),) if table.find(*symbols)]
     try:
-        readings = read_readings(file)
+        readings = readings_of_table(table, Columns(), file.stem, file.name)
     except InputError as error:
         report = examine(b, vector_nt=vector, t=t, roles=roles, unit=unit)
         more: dict[str, object] = {"no survey yet": str(error).removeprefix(f"{table.path}: ")}
         then = f"{shlex.quote(str(file))} --waypoints MARKS.csv" if "--waypoints" in str(error) else ""
     else:
-        yaw = None if readings.by_hand else readings.yaw
         report = examine(
             readings.b_nt,
             vector_nt=vector if vector is not None and len(vector) == len(readings) else None,
             t=readings.t,
             p_xy=readings.p_xy,
-            yaw=yaw,
+            yaw=None if readings.by_hand else readings.yaw,
             roles=roles,
             unit=unit,
         )
-        more = {"taken": taken_of(readings)} if taken_of(readings) else {}
+        more = {"taken": taken} if (taken := taken_of(readings)) else {}
         then = shlex.quote(str(file))
     more |= {"next": f"magtwin map import {then}"} if then else {}
     facts = (Figure("columns", ", ".join(table.names)),)
@@ -130,18 +129,8 @@ def _fit(use: str, has: set[str], b: Array, p: Array | None) -> str:
 
 def _rounding(values: Array) -> Figure:
     """The step to which the sensor or the logger rounds [nT], if it does."""
-    columns = values.reshape(len(values), -1).T
-    steps = []
-    for column in columns:
-        gaps = np.diff(np.unique(np.round(column, 6)))
-        if not len(gaps):
-            continue
-        step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
-        whole = (column - column[0]) / step
-        size = 1e-6 * float(np.abs(column).max())  # of rounding in a text of seven digits
-        if step > size and np.mean(np.abs(whole - np.round(whole)) < STEPS + size / step) > 0.99:
-            steps.append(step)
-    if len(steps) < len(columns):
+    steps = [step_of(column, 0.99) for column in values.reshape(len(values), -1).T]
+    if not all(steps):
         return Figure("sensor's step", "none seen")
     return Figure("sensor's step", float(f"{max(steps):.3g}"), "nT")
 

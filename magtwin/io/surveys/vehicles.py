@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
+from magtwin.frames import quat_from_rpy, quat_multiply, xyzw_from_wxyz, yaw_from_quat
+from magtwin.io.surveys.axes import levelled
 
 Array = NDArray[np.float64]
 Columns = dict[str, Array]
@@ -27,6 +29,11 @@ FLIGHT = {
 }
 """Names of the data sets of a flight, the best first. Those of SGL's flights for MagNav are the first ones,
 of which mag_1_uc is the magnetometer on the tail, not compensated."""
+
+
+HALF = float(np.sqrt(0.5))
+ENU_NED, FORWARD = (HALF, HALF, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
+"""Turns xyzw: axes north, east, down in east, north, up; axes forward, left, up in forward, right, down."""
 
 
 def columns_of_log(path: Path) -> Columns:
@@ -73,13 +80,7 @@ def _px4(path: Path) -> Columns:
     q = np.column_stack([turn[f"q[{k}]"] for k in range(4)])  # w, x, y, z: body to north, east, down
     q *= np.cumprod(np.where(np.sum(q * np.roll(q, 1, axis=0), axis=1) < 0, -1, 1))[:, None]
     q = np.column_stack([np.interp(t, turn["timestamp"] / 1e6, part) for part in q.T])
-    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    angles = (
-        np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-        np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)),
-        np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-    )
-    return columns | _levelled(1e5 * gauss, *angles)
+    return columns | _levelled(1e5 * gauss, xyzw_from_wxyz(q / np.linalg.norm(q, axis=1, keepdims=True)))
 
 
 def _ardupilot(path: Path) -> Columns:
@@ -108,8 +109,8 @@ def _ardupilot(path: Path) -> Columns:
     if not rows["ATT"]:
         return columns | {"field [nT]": np.linalg.norm(b, axis=1)}
     at, *degrees = np.array(rows["ATT"]).T
-    angles = (np.interp(t, at, np.unwrap(np.radians(part))) for part in degrees)
-    return columns | _levelled(b, *angles)
+    angles = [np.interp(t, at, np.unwrap(np.radians(part))) for part in degrees]
+    return columns | _levelled(b, quat_from_rpy(np.column_stack(angles)))
 
 
 def _flight(path: Path) -> Columns:
@@ -134,10 +135,14 @@ def _flight(path: Path) -> Columns:
     return {label: values for label, values in columns.items() if len(values) == rows}
 
 
-def _levelled(b: Array, roll: Array, pitch: Array, yaw: Array) -> Columns:
-    """Vectors forward, right, down as level ones forward, left, up, by angles [rad] to north, east, down."""
-    x, y, z = b.T
-    right = np.cos(roll) * y - np.sin(roll) * z
-    below = np.sin(roll) * y + np.cos(roll) * z
-    forward, down = np.cos(pitch) * x + np.sin(pitch) * below, np.cos(pitch) * below - np.sin(pitch) * x
-    return {"yaw [rad]": np.pi / 2 - yaw, "bx [nT]": forward, "by [nT]": -right, "bz [nT]": -down}
+def _levelled(b: Array, q_ned_body: Array) -> Columns:
+    """Vectors forward, right, down as level ones forward, left, up, and headings from east.
+
+    Orientations xyzw are those of a body forward, right, down in axes north, east, down.
+    """
+    q = quat_multiply(quat_multiply(ENU_NED, q_ned_body), FORWARD)
+    level = levelled(b * (1.0, -1.0, -1.0), q, "body")
+    return {
+        "yaw [rad]": yaw_from_quat(q),
+        **dict(zip(("bx [nT]", "by [nT]", "bz [nT]"), level.T, strict=True)),
+    }

@@ -162,5 +162,6 @@ def test_a_command_says_each_mismatch_once_on_stderr_and_info_shows_it(lab_scene
     lines = [line for line in shown.err.splitlines() if "warning" in line]
     assert len(lines) == 3
     assert lines[0].startswith("magtwin: warning: WRONG ROBOT: strange.safetensors")
+    assert "WRONG ROBOT" in shown.out
     main(["info", str(out / "run.parquet")])
     assert "WRONG ROBOT" in capsys.readouterr().out
