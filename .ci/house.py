@@ -27,7 +27,7 @@ that a table names as text, since these are loaded for one format or method only
 """
 
 ROOMS = {
-    "magtwin": 1_210,
+    "magtwin": 1_220,
     "author": 3_600,
     "bench": 3_220,
     "cli": 4_920,
@@ -36,7 +36,7 @@ ROOMS = {
     "field": 9_190,
     "files": 1_690,
     "figures": 4_830,
-    "io": 10_580,
+    "io": 10_590,
     "learn": 9_290,
     "localization": 5_990,
     "parallel": 930,

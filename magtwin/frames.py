@@ -68,6 +68,15 @@ def quat_multiply(a: ArrayLike, b: ArrayLike) -> Array:
     )
 
 
+def enu_from_ned(q_ned_frd: ArrayLike) -> Array:
+    """Orientations xyzw from axes north, east, down to east, north, up, shape (..., 4).
+
+    The axes of the body become forward, left, up; they were forward, right, down.
+    """
+    enu = np.array([1.0, 1.0, 0.0, 0.0]) / np.sqrt(2.0)  # half a turn about x + y
+    return quat_multiply(quat_multiply(enu, q_ned_frd), np.array([1.0, 0.0, 0.0, 0.0]))
+
+
 def quat_conjugate(q: ArrayLike) -> Array:
     """Inverses of unit quaternions xyzw, shape (..., 4)."""
     return np.asarray(q, float) * (-1.0, -1.0, -1.0, 1.0)

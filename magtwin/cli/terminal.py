@@ -72,9 +72,8 @@ class Done:
         following = [shlex.join(map(str, words)) for words in self.next]
         written = [folder for path in wrote for folder in (Path(path), *Path(path).parents)]
         renamed = [str(asked) for asked, new in instead().items() if new in written]
-        said = (
-            f"{' and '.join(renamed)} exist{'s' if len(renamed) == 1 else ''}: wrote" if renamed else "Wrote"
-        )
+        exist = f"{' and '.join(renamed)} exist{'s' if len(renamed) == 1 else ''}"
+        said = f"{exist}: wrote" if renamed else "Wrote"
         said = f"{said} {listed(wrote, WIDTH)}" if wrote else ""
         if not any(_mode.values()):
             inside = ""
@@ -104,7 +103,7 @@ class Done:
             return _cut(self.lines, room, self.rest)
         report, named = self.report, {figure.name: figure for figure in self.report.figures}
         flags = [figure for figure in report.figures if FLAG in figure.name]
-        lines = [_bold(report.title), *([_bold(report.verdict)] if report.verdict else [])]
+        lines = [_bold(line) for line in (report.title, report.verdict) if line]
         wrong = [str(each) for name, each in report.metadata.items() if name.endswith(MISMATCH)]
         if self.whole:
             words = [

@@ -118,7 +118,7 @@ def test_diff_tells_and_draws_what_changed(tmp_path, layer, capsys):
     assert region["centre_m"] == [-0.5, -0.5]
     assert region["peak_nt"] == pytest.approx(400, abs=0.01)
     where = "z 56.6, about (-0.50, -0.50) m, x -0.5..-0.5, y -0.5..-0.5 m, 1 node"
-    assert where in said["notes"].values()
+    assert said["notes"]["region_1_nt"] == where
     words = "".join(ElementTree.parse(tmp_path / "d.svg").getroot().itertext())
     assert "hall 2026-01-01 to hall 2026-02-01" in words
 

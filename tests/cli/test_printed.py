@@ -18,11 +18,13 @@ from magtwin.errors import InputError
 ROOT = Path(__file__).parents[2]
 
 TAKEN = (
-    *("new", "schema", "robot", "robot to urdf", "scene", "map import", "map fit", "map export", "map plot"),
+    *("new", "schema", "robot", "robot to urdf", "scene", "map import", "map fit", "map export", "plot"),
     *("map upward", "map occupancy", "map survey", "convert parquet", "report", "localize", "export layer"),
-    *("dataset build", "train linear", "network export", "evaluate", "sweep", "bench", "bench report"),
+    *("dataset build", "train linear", "model export", "evaluate", "sweep", "bench", "bench report"),
 )
 """Commands that are also typed on full disks, by their names there."""
+
+assert set(TAKEN) <= {command.name for command in COMMANDS}
 
 SHOWN = (
     "run lab --duration-s 2",

@@ -12,7 +12,9 @@ from magtwin.io.bags.types import layout
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 KINDS = sorted(
-    {kind for topic in TOPICS.values() for kind in (topic.kind, *topic.reads) if kind in STORE.fielddefs}
+    kind
+    for kind in {kind for topic in TOPICS.values() for kind in (topic.kind, *topic.reads)}
+    if not kind.startswith("px4_msgs/")  # which bags bring with them
 )
 DIAGNOSTICS = {"status": 2, "status.0.values": 0, "status.1.values": 2}
 FORMS = [(kind, {}) for kind in KINDS]

@@ -174,8 +174,12 @@ def test_what_changed_is_named_and_the_columns_that_differ(lab_scene, tmp_path, 
     lines = capsys.readouterr().out.splitlines()
     assert stop.value.code == 1
     assert lines[1].startswith("DIFFERENT: ")
-    assert any(line.startswith("another version of magtwin: magtwin was 0.0.1, is ") for line in lines)
-    assert any(line.startswith(f"the map changed: map_sha256 was {'0' * 64}, is ") for line in lines)
+    causes = [
+        "another version of magtwin: magtwin was 0.0.1, is ",
+        f"the map changed: map_sha256 was {'0' * 64}, is ",
+    ]
+    first = next(k for k, line in enumerate(lines) if line.startswith(causes[0]))
+    assert lines[first + 1].startswith(causes[1])
     column = next(line for line in lines if line.startswith("b_total_nt"))
     assert "12.5" in column
     assert f"{run.rows - 7} of {run.rows} rows, from row 8 on" in column

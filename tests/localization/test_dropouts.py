@@ -68,7 +68,8 @@ def test_a_run_without_a_reading_is_dead_reckoning_and_is_not_judged(run):
     assert printed["verdict"] == report.verdict
     assert printed["figures"]["with_a_reading"] == 0
     assert printed["metadata"]["readings"].startswith("0 in ")
-    assert not {"ANEES per state", "in the 90 % ellipse", "flagged lost", "bound"} & set(printed["figures"])
+    judged = {"anees_per_state", "in_the_90_percent_ellipse", "flagged_lost", "bound_m", "bound_exact_map_m"}
+    assert not judged & set(printed["figures"])
     assert "Dead reckoning: no row" in draw_localization(made).get_suptitle()
     error = np.sqrt(np.mean(np.sum((made.track.pose - made.truth)[:, :2] ** 2, axis=1)))
     assert printed["figures"]["position_error_rmse_m"] == pytest.approx(error)

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from magtwin.frames import quat_conjugate, quat_multiply, rotate
+from magtwin.frames import enu_from_ned, quat_conjugate, quat_multiply, rotate
 from magtwin.io.bags.sender import Sender
 
 Array = NDArray[np.float64]
@@ -291,13 +291,11 @@ def _of_ned(columns: dict[str, Array], name: str = "odom") -> dict[str, Array]:
     Its quaternion is w first, and its velocity is in north-east-down.
     """
     q_ned_frd = columns[f"{name}_q_xyzw"][:, [1, 2, 3, 0]]
-    enu = np.array([1.0, 1.0, 0.0, 0.0]) / np.sqrt(2.0)  # half a turn about x + y
-    q = quat_multiply(quat_multiply(enu, q_ned_frd), np.array([1.0, 0.0, 0.0, 0.0]))
     p = columns[f"{name}_p"][:, [1, 0, 2]] * (1.0, 1.0, -1.0)
     turned = _of_frd({"odom_w": columns["odom_w"]}) if "odom_w" in columns else {}
     if "odom_v" in columns:
         turned |= _of_frd({"odom_v": rotate(quat_conjugate(q_ned_frd), columns["odom_v"])})
-    return {f"{name}_p": p, f"{name}_q_xyzw": q} | turned
+    return {f"{name}_p": p, f"{name}_q_xyzw": enu_from_ned(q_ned_frd)} | turned
 
 
 _PX4 = "px4_msgs/msg/"

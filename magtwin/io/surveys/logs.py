@@ -7,17 +7,19 @@ of the field gets the places of the others, joined by time.
 import re
 import zipfile
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
+from magtwin.field.survey.folder import LARGEST_TURN
 from magtwin.files.budget import BUDGETS, allowed, check_size
 from magtwin.files.kinds import ARCHIVE, TABLE, kind_of
+from magtwin.io.surveys.places import between
 from magtwin.io.surveys.walk import Marks, marks_of, walked
-from magtwin.tables.labels import words_of
+from magtwin.tables.labels import meaning_of, words_of
+from magtwin.tables.quantities import CLOCKWISE, DEGREES
 from magtwin.tables.table import PARQUET, SPREADSHEETS, Column, Table, read_table, since_1970
 
 Array = NDArray[np.float64]
@@ -190,7 +192,10 @@ def _accelerations(parts: Parts) -> tuple[Array, Array] | None:
     for name, part in parts.items():
         if _has(name, ACCELERATION) and part.find("t") and not {"x", "y", "z"} - set(part.names):
             t, _ = since_1970(part, part.find("t")[0])
-            return t, np.column_stack([part.numbers(axis) for axis in "xyz"])
+            moved = np.column_stack([t, *(part.numbers(axis) for axis in "xyz")])
+            moved = moved[np.isfinite(moved).all(axis=1)]
+            moved = moved[np.argsort(moved[:, 0], kind="stable")]
+            return (moved[:, 0], moved[:, 1:]) if len(moved) else None
     return None
 
 
@@ -198,13 +203,22 @@ def _joined(field: Table, other: Table, labels: list[str]) -> Table:
     """A table with columns of another, between whose rows they are linear in time."""
     at, _ = since_1970(other, other.find("t")[0])
     t, _ = since_1970(field, field.find("t")[0])
-    order = np.argsort(at, kind="stable")
-    columns = []
-    for label in labels:
-        values = np.interp(t, at[order], other.numbers(label)[order], np.nan, np.nan)
-        columns.append(Column(label, values, field.path, None))
-    note = f"{' and '.join(labels)} of {other.path.name}, by time"
-    return Table((*field.columns, *columns), (*field.notes, note), field.comments)
+    cells = [between(t, at, other.numbers(label), _period(other, label)) for label in labels]
+    columns = (Column(label, values, field.path, None) for label, values in zip(labels, cells, strict=True))
+    kept = (column for column in field.columns if column.name not in labels)
+    where = f"of {other.path.name}" if other is not field else "between the rows that have them"
+    note = f"{' and '.join(labels)} {where}, by time"
+    return Table((*kept, *columns), (*field.notes, note), field.comments)
+
+
+def _period(table: Table, label: str) -> float | None:
+    """The period of a heading in the unit of its column; None for other columns."""
+    meaning = meaning_of(label, "heading")
+    if meaning is None:
+        return None
+    values = table.numbers(label)
+    turns = np.nanmax(np.abs(values), initial=0.0) > LARGEST_TURN
+    return 360.0 if turns or meaning.unit in DEGREES or meaning.name in CLOCKWISE else 2 * np.pi
 
 
 def _filled(table: Table, labels: list[str]) -> Table:
@@ -212,19 +226,11 @@ def _filled(table: Table, labels: list[str]) -> Table:
     names = table.find("field") or table.find("bx", "by", "bz")
     if not names or not table.find("t"):
         return table
-    read = np.isfinite(np.column_stack([table.numbers(name) for name in names])).all(axis=1)
-    placed = np.isfinite(np.column_stack([table.numbers(name) for name in labels])).all(axis=1)
-    if (read & placed).any() or not placed.any():
-        return table
-    t, _ = since_1970(table, table.find("t")[0])
-    cells = {}
-    for name in labels:
-        values = table.numbers(name)[placed]
-        values = np.unwrap(values) if name not in labels[:2] and "deg" not in name.lower() else values
-        cells[name] = np.interp(t, t[placed], values, np.nan, np.nan)
-    columns = (replace(c, cells=cells[c.name]) if c.name in cells else c for c in table.columns)
-    note = f"{', '.join(labels)} between the rows that have them, by time"
-    return Table(tuple(columns), (*table.notes, note), table.comments)
+    read, placed = (
+        np.isfinite(np.column_stack([table.numbers(name) for name in some])).all(axis=1)
+        for some in (names, labels)
+    )
+    return table if (read & placed).any() or not placed.any() else _joined(table, table, labels)
 
 
 def table_of(path: Path, columns: Mapping[str, Array]) -> Table:

@@ -1,4 +1,4 @@
-"""Places: latitudes and longitudes as positions on a plane."""
+"""Places: latitudes and longitudes as positions on a plane, and values between the times that have them."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,19 @@ def on_tangent_plane(lat_deg: Array, lon_deg: Array) -> tuple[Array, str]:
     slope = np.radians(lat0)
     north = -np.sin(slope) * away[:, 0] + np.cos(slope) * away[:, 2]
     return np.column_stack([away[:, 1], north]), f"tangent plane of WGS 84 at {lat0:g}, {lon0:g} deg"
+
+
+def between(t: Array, at: Array, values: Array, period: float | None = None) -> Array:
+    """Values at times t (N,), linear between those at times `at` (K,), in any order; nan outside of them.
+
+    `period` is that of angles, such as 360.
+    """
+    known = np.isfinite(at) & np.isfinite(values)
+    order = np.flatnonzero(known)[np.argsort(at[known], kind="stable")]
+    if not len(order):
+        return np.full(len(t), np.nan)
+    along = values[order] if period is None else np.unwrap(values[order], period=period)
+    return np.interp(t, at[order], along, np.nan, np.nan)
 
 
 def _geocentric(lat_deg: Array, lon_deg: Array) -> Array:

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.frames import quat_from_rpy, quat_multiply, xyzw_from_wxyz, yaw_from_quat
+from magtwin.frames import enu_from_ned, quat_from_rpy, xyzw_from_wxyz, yaw_from_quat
 from magtwin.io.surveys.axes import levelled
+from magtwin.io.surveys.places import between
 
 Array = NDArray[np.float64]
 Columns = dict[str, Array]
@@ -29,11 +30,6 @@ FLIGHT = {
 }
 """Names of the data sets of a flight, the best first. Those of SGL's flights for MagNav are the first ones,
 of which mag_1_uc is the magnetometer on the tail, not compensated."""
-
-
-HALF = float(np.sqrt(0.5))
-ENU_NED, FORWARD = (HALF, HALF, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
-"""Turns xyzw: axes north, east, down in east, north, up; axes forward, left, up in forward, right, down."""
 
 
 def columns_of_log(path: Path) -> Columns:
@@ -73,13 +69,13 @@ def _px4(path: Path) -> Columns:
     columns = {"t": t}
     if place := topics.get("vehicle_local_position"):
         at = place["timestamp"] / 1e6
-        columns |= {"x [m]": np.interp(t, at, place["y"]), "y [m]": np.interp(t, at, place["x"])}
+        columns |= {"x [m]": between(t, at, place["y"]), "y [m]": between(t, at, place["x"])}
     turn = topics.get("vehicle_attitude")
     if turn is None:
         return columns | {"field [nT]": 1e5 * np.linalg.norm(gauss, axis=1)}
     q = np.column_stack([turn[f"q[{k}]"] for k in range(4)])  # w, x, y, z: body to north, east, down
     q *= np.cumprod(np.where(np.sum(q * np.roll(q, 1, axis=0), axis=1) < 0, -1, 1))[:, None]
-    q = np.column_stack([np.interp(t, turn["timestamp"] / 1e6, part) for part in q.T])
+    q = np.column_stack([between(t, turn["timestamp"] / 1e6, part) for part in q.T])
     return columns | _levelled(1e5 * gauss, xyzw_from_wxyz(q / np.linalg.norm(q, axis=1, keepdims=True)))
 
 
@@ -98,18 +94,20 @@ def _ardupilot(path: Path) -> Columns:
         kind = message.get_type()
         if not getattr(message, "I", 0):
             rows[kind].append([float(getattr(message, label)) for label in labels[kind]])
+    log.data_map.close()
+    log.filehandle.close()
     if not rows["MAG"]:
         raise InputError(f"{path}: no message MAG in it, which holds the compass")
     t, *mag = np.array(rows["MAG"]).T
     columns = {"t": t / 1e6}
     if rows["POS"]:
         at, lon, lat = np.array(rows["POS"]).T
-        columns |= {"lon": np.interp(t, at, lon), "lat": np.interp(t, at, lat)}
+        columns |= {"lon": between(t, at, lon), "lat": between(t, at, lat)}
     b = 1e2 * np.column_stack(mag)
     if not rows["ATT"]:
         return columns | {"field [nT]": np.linalg.norm(b, axis=1)}
     at, *degrees = np.array(rows["ATT"]).T
-    angles = [np.interp(t, at, np.unwrap(np.radians(part))) for part in degrees]
+    angles = [np.radians(between(t, at, part, 360.0)) for part in degrees]
     return columns | _levelled(b, quat_from_rpy(np.column_stack(angles)))
 
 
@@ -140,7 +138,7 @@ def _levelled(b: Array, q_ned_body: Array) -> Columns:
 
     Orientations xyzw are those of a body forward, right, down in axes north, east, down.
     """
-    q = quat_multiply(quat_multiply(ENU_NED, q_ned_body), FORWARD)
+    q = enu_from_ned(q_ned_body)
     level = levelled(b * (1.0, -1.0, -1.0), q, "body")
     return {
         "yaw [rad]": yaw_from_quat(q),

@@ -108,13 +108,13 @@ def _moved(t: Array, stills: list[tuple[float, float]]) -> Array:
 
 def _stills(t: Array, acceleration: Array) -> list[tuple[float, float]]:
     """Begin and end of the pauses of a walker [s], by accelerations."""
-    second = np.floor(2 * (t - t[0])).astype(np.intp)  # halves of a second
-    count = np.maximum(np.bincount(second), 1)
+    halves, second = np.unique(np.floor(2 * (t - t[0])), return_inverse=True)  # of a second
+    count = np.bincount(second)
     spread = np.zeros(len(count))
     for part in acceleration.T:
         mean = np.bincount(second, part) / count
         spread += np.bincount(second, (part - mean[second]) ** 2) / count
-    return _stretches(t[0] + np.arange(len(count) + 1) / 2, np.sqrt(spread) < STILL_M_S2)
+    return _stretches(t[0] + np.append(halves, halves[-1] + 1) / 2, np.sqrt(spread) < STILL_M_S2)
 
 
 def _quiet(table: Table, t: Array) -> list[tuple[float, float]]:
