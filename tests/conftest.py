@@ -1,5 +1,6 @@
 """What tests share: the real data beside the checkout, and the default lab, authored once."""
 
+import os
 import shutil
 import signal
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ from hypothesis import settings
 settings.register_profile("fixed", derandomize=True, deadline=None, database=None)
 settings.load_profile("fixed")
 
+os.environ.pop("COLUMNS", None)  # what is printed has the same lines on any terminal
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where a shell began this in the background
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -103,7 +103,7 @@ class Done:
             return _cut(self.lines, room, self.rest)
         report, named = self.report, {figure.name: figure for figure in self.report.figures}
         flags = [figure for figure in report.figures if FLAG in figure.name]
-        lines = [_bold(line) for line in (report.title, report.verdict) if line]
+        lines = "\n".join(_bold(line) for line in (report.title, report.verdict) if line).splitlines()
         wrong = [str(each) for name, each in report.metadata.items() if name.endswith(MISMATCH)]
         if self.whole:
             words = [
@@ -111,16 +111,16 @@ class Done:
             ]
             lists = [line for name, each in report.metadata.items() for line in _notes(name, each)]
             return [*lines, *_rows(report.figures), *aligned([row for row in words if row[1]]), *lists]
-        chosen = [named[name] for name in self.figures if name in named]
-        if not self.figures:
-            chosen = [figure for figure in report.figures if figure not in flags]
-        lines += [*map(printable, wrong), *_rows(chosen[:MOST_FIGURES], clip=True)]
-        if flags:
-            counts = ", ".join(f"{f.value:,} {f.name.replace(FLAG, '')}" for f in flags)
-            lines.append(f"readings in doubt  {counts}")
+        plain = [figure for figure in report.figures if figure not in flags]
+        chosen = [named[name] for name in self.figures if name in named] if self.figures else plain
+        lines += map(printable, wrong)
+        most = max(min(MOST_FIGURES, room - len(lines) - bool(flags) - 1), 1)
+        lines += _rows(chosen[:most], clip=True)
+        counts = ", ".join(f"{f.value:,} {f.name.replace(FLAG, '')}" for f in flags)
+        lines += [f"readings in doubt  {counts}"] if flags else []
         notes = [line for name, each in report.metadata.items() for line in _notes(name, each, brief=True)]
         facts = [each for each in report.metadata.values() if not isinstance(each, LISTS) and each != ""]
-        left = len(report.figures) - len(flags) - min(len(chosen), MOST_FIGURES) + len(facts) - len(wrong)
+        left = len(report.figures) - len(flags) - min(len(chosen), most) + len(facts) - len(wrong)
         room = min(room - len(lines), MOST_NOTES + 2)
         return lines + _cut([*self.lines, *notes], room, self.rest, left if self.rest else 0)
 

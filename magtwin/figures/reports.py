@@ -50,6 +50,8 @@ ALIGNED = {
 }
 """How two traversals of a path are aligned."""
 
+MOST_DRAWN = 12  # Runs of a page whose paths are drawn
+
 OVERVIEW = Table(
     "Overview",
     ("run", "path", "seed", "readings", "duration [s]", "distance [m]", "MAE [nT]", "RMS [nT]", "events"),
@@ -111,6 +113,9 @@ def page_of_runs(runs: Sequence[NamedRun], *, advance: Callable[[int], None] = l
             title = f"{len(runs)} robots in {first.run.metadata.get('scene', 'a scene')}"
             lead = f"{', '.join(str(run.metadata['robot']) for run in every)} drove together."
         return Page(title, "" if verdict else lead, tuple(sections), player=player, verdict=verdict)
+    for k, named in enumerate(runs[:MOST_DRAWN]):
+        path = path_picture(named.run, named.field, named.planned)
+        sections[k] = replace(sections[k], pictures=() if path is None else (path,))
     overview = replace(OVERVIEW, rows=tuple(map(overview_of, runs)))
     lead = f"{sum(named.run.rows for named in runs):,} readings in all."
     return Page(f"{len(runs)} runs", lead, tuple(sections), overview)

@@ -21,16 +21,15 @@ SCHEMAS = Path(__file__).resolve().parents[1] / "spec/toml"
 """JSON schemas of TOML files, KIND.schema.json: scene, sources, robot, suite, training (docs/schemas.py)."""
 
 
-def copy_schemas(folder: str | os.PathLike[str], *kinds: str) -> list[Path]:
+def copy_schemas(folder: str | os.PathLike[str]) -> list[Path]:
     """Copy JSON schemas, by which editors complete and check a TOML, into a folder, which is made.
 
     The first line of the TOML names its schema: `#:schema ./scene.schema.json`.
 
     Args:
         folder: Where they are written; those of another version are replaced.
-        *kinds: Kinds of files. Default: all.
     """
-    names = [f"{kind}.schema.json" for kind in kinds] or sorted(file.name for file in SCHEMAS.glob("*.json"))
+    names = sorted(file.name for file in SCHEMAS.glob("*.json"))
     Path(folder).mkdir(parents=True, exist_ok=True)
     for name in names:
         Path(folder, name).write_bytes((SCHEMAS / name).read_bytes())

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from magtwin.errors import InputError, find
 from magtwin.files.file import sha256, shipped
 from magtwin.files.kinds import expected
-from magtwin.files.outputs import WORKSHOP, check_free, output
+from magtwin.files.outputs import WORKSHOP, check_free, output, transaction
 from magtwin.files.settings import copy_schemas
 from magtwin.spec.lab import SurveySpec
 from magtwin.spec.obstacles import Obstacles
@@ -275,7 +275,8 @@ def new_scene(
     else:
         text = shipped("scenes", "starter.toml").read_text(encoding="utf-8")
         text = text.replace('name = "room"', f'name = "{name}"', 1)
-    with output(out, force=force) as aside:
+    schemas = FilePath(out).parent / SCHEMA_FOLDER
+    with transaction(), output(out, force=force) as aside, output(schemas, force=True) as folder:
         aside.write_text(f"#:schema ./{SCHEMA_FOLDER}/scene.schema.json\n\n{text}", encoding="utf-8")
-        copy_schemas(FilePath(out).parent / SCHEMA_FOLDER, "scene")
+        copy_schemas(folder)
     return FilePath(out)

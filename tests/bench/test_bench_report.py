@@ -9,9 +9,9 @@ import pytest
 from matplotlib.colors import to_hex
 from scipy.stats import binomtest
 
-from magtwin.bench import report
 from magtwin.bench.report import report_results
 from magtwin.bench.runner import benchmark
+from magtwin.figures import canvas
 
 pytest.importorskip("pandas")
 
@@ -51,12 +51,15 @@ def made(tmp_path_factory):
     (folder / "uneven.toml").write_text(SUITE)
     benchmark(folder / "uneven.toml", folder / "results", runs=3, jobs=1)
     benchmark(folder / "uneven.toml", folder / "results", runs=5, localizers=["ekf"], jobs=1)
-    figures, picture = {}, report.picture
+    figures, picture = {}, canvas.picture
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            report,
+            canvas,
             "picture",
-            lambda figure, *a, file: (figures.update({file: figure}), picture(figure, *a, file=file))[1],
+            lambda figure, *a, file, **k: (
+                figures.update({file: figure}),
+                picture(figure, *a, file=file, **k),
+            )[1],
         )
         report_results([folder / "results"], folder / "page")
     return folder / "results", folder / "page", figures

@@ -158,8 +158,9 @@ def test_a_stdout_that_is_full_is_named(unbuffered):
             command, check=False, stdout=full, stderr=subprocess.PIPE, text=True, env=environment
         )
     assert done.returncode == 1
-    assert done.stderr.startswith("magtwin: stdout cannot be written (No space left on device);")
-    assert done.stderr.count("\n") == 1
+    said = [line for line in done.stderr.splitlines() if "s so far" not in line]  # on a slow machine
+    assert len(said) == 1
+    assert said[0].startswith("magtwin: stdout cannot be written (No space left on device);")
 
 
 @pytest.mark.parametrize(("sign", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])

@@ -21,6 +21,7 @@ from magtwin.io.rerun.series import (
     derived,
     entity_of,
 )
+from magtwin.run.arrow import without_pandas
 from magtwin.run.run import COLUMNS, Run
 from magtwin.spec.base import Vec3
 from magtwin.spec.lab import LabSpec
@@ -335,11 +336,12 @@ def _event_view() -> rrb.TextLogView:
     return rrb.TextLogView(origin="events", name="Events", columns=shown)
 
 
-UP_TO_NOW = rrb.VisibleTimeRanges(
-    rrb.VisibleTimeRange(
-        TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
+with without_pandas():
+    UP_TO_NOW = rrb.VisibleTimeRanges(
+        rrb.VisibleTimeRange(
+            TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
+        )
     )
-)
 """Visible part of what accumulates: all up to the time shown."""
 
 

@@ -327,10 +327,10 @@ def _reason(log: str) -> str:
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
     """End a process and its children."""
-    for ask in (True, False):
-        if process.poll() is None:
-            end_group(process.pid, ask=ask)
-            try:
-                process.wait(5)
-            except subprocess.TimeoutExpired:
-                continue
+    if process.poll() is None:
+        end_group(process.pid, ask=True)
+        try:
+            process.wait(5)
+        except subprocess.TimeoutExpired:
+            end_group(process.pid)
+            process.wait()

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 SCALERS = ("x_mean", "x_scale", "x_min", "x_max")  # Tensors of a weights file that hold scaler and ranges
 FAR = 5.0  # Scales from the mean beyond which an input is outside if the training range is unknown
 MANY = 0.05  # Share of readings outside the training range from which that is told
+SLACK = 0.1  # Share of the range by which they must be outside
 WORST = 3  # Inputs that are named
 _BLOCK = 512  # Rows compared at once, to stay in the cache of a core
 
@@ -98,17 +99,18 @@ class Inputs(Summarized):
         return ~inside
 
     def worst(self, x: ArrayLike) -> str:
-        """The inputs that most rows have outside of the training range; "" if at most `MANY` rows have.
+        """The inputs that most rows have outside of the training range; "" if few rows have.
 
         Each with the value that is furthest outside, and the range.
         """
         x = self.checked(x)
         low, high = self.within
         beyond = np.maximum(np.maximum(low - x, x - high), 0) / np.where(high > low, high - low, 1.0)
-        rows = np.count_nonzero((beyond > 0).any(axis=1) | np.isnan(x).any(axis=1))
+        outside = (beyond > SLACK) | np.isnan(x)
+        rows = np.count_nonzero(outside.any(axis=1))
         if rows <= MANY * len(x):
             return ""
-        shares = np.mean((beyond > 0) | np.isnan(x), axis=0)
+        shares = np.mean(outside, axis=0)
         named = []
         for k in np.argsort(-shares, kind="stable")[:WORST].tolist():
             if shares[k] > 0:
