@@ -131,7 +131,7 @@ def test_a_stranger_in_rclpy_sees_the_robot_obeys_its_clock_and_drives_it(
 
 OURS = """
 import sys, threading, time
-sys.path[:0] = sys.argv[1:]
+sys.path[:0] = sys.argv[1:3]
 from magtwin.files.file import shipped
 from magtwin.ros.bus import open_bus
 from magtwin.ros.simulate import Simulator
@@ -148,12 +148,17 @@ simulated.start()
 rclpy.init()
 node = rclpy.create_node("caller")
 knob = node.create_publisher(Empty, "/robot/reset", 10)
-while simulator.online.t < 3.0:
+while not node.count_subscribers(sys.argv[3]):
+    time.sleep(0.05)
+start = simulator.online.t
+while simulator.online.t < start + 3.0:
     time.sleep(0.05)
 while not any("reset" in line for line in lines):
     knob.publish(Empty())
     time.sleep(0.2)
 assert simulator.online.t < 2.0
+while simulator.online.t < 1.0:
+    time.sleep(0.05)
 over.set()
 simulated.join()
 print(bus.backend, len(lines))
@@ -173,7 +178,7 @@ def test_the_robot_is_simulated_on_rclpy_too_and_reset(
     libraries = str(Path(np.__file__).parents[1])  # magtwin's own, beside rclpy of that environment
     ear, heard = open_bus("ear", backend="cyclonedds"), list[Message]()
     ear.subscribe(MAGNITUDE.name, MAGNITUDE.kind, heard.append, MAGNITUDE.qos)
-    command = [python, "-c", OURS, str(BUILD.parent), libraries]
+    command = [python, "-c", OURS, str(BUILD.parent), libraries, MAGNITUDE.name]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as ours:
         while ours.poll() is None:
             ear.spin_once(0.05)
