@@ -489,8 +489,7 @@ class Room(Summarized):
             ("robots", listed([robot["name"] for robot in table.get("robot", ())], 80) or "none yet"),
             ("earth", f"{earth['latitude_deg']:g}, {earth['longitude_deg']:g} deg, {earth['date']}"),
         ]
-        x0, x1, y0, y1 = lab.extent_m
-        return Summary(f"Room {table['name']}: floor {x1 - x0:g} x {y1 - y0:g} m", tuple(rows))
+        return Summary(f"Room {table['name']}: floor {lab.size_text}", tuple(rows))
 
     def _lab(self) -> LabSpec:
         """The room without what stands in it, and with its walls."""

@@ -119,10 +119,9 @@ class Twin(Summarized):
         plant = self.metadata.get("plant", OF_SCENE if robot.plant != PlantSpec() else "")
         sensor += f", plant {plant}" if plant else ""
         more = f", and {len(self.scene.others)} more robots" if self.scene.others else ""
-        x0, x1, y0, y1 = self.scene.lab.extent_m
         network = self.magnetometer._summary().title.partition(" ")[2] if self.magnetometer else "none"
         return Summary(
-            f"Twin {self.scene.name}: floor {x1 - x0:g} x {y1 - y0:g} m, {len(self.obstacles)} obstacles",
+            f"Twin {self.scene.name}: floor {self.scene.lab.size_text}, {len(self.obstacles)} obstacles",
             (
                 ("robot", sensor + more + (f", session {self.session['session']}" if self.session else "")),
                 ("map", field.title.partition(" ")[2]),

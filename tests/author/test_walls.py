@@ -16,7 +16,7 @@ from magtwin.field.sources.bodies import MU_0, Bodies
 from magtwin.field.sources.magnets import body_of
 from magtwin.path import Room, path_in
 from magtwin.path.points import path_of_points
-from magtwin.spec.lab import LabSpec, check_corners, on_polygon
+from magtwin.spec.lab import LabSpec, check_corners
 from magtwin.spec.walls import Door, Wall, Window
 from magtwin.twin import author_scene, open_twin, room_of, scan, scene_from_toml, simulate
 from magtwin.usd.lab.room import define_lab
@@ -79,7 +79,7 @@ def l_room(tmp_path_factory):
 
 
 def lab_room(lab: LabSpec, radius: float = 0.171) -> Room:
-    return Room(lab.floor_m, radius, obstacles_in(lab, ()), lab.border)
+    return Room(lab, radius, obstacles_in(lab, ()))
 
 
 def test_a_stage_of_walls_reads_back_as_its_toml_and_is_valid(l_room, tmp_path):
@@ -188,8 +188,8 @@ def test_coverage_enters_every_room_of_an_l_through_open_doors(l_room):
     rng, corners = np.random.default_rng(2), np.array(twin.scene.lab.corners)
     p = rng.uniform(corners.min(0), corners.max(0), (4000, 2))
     keep = twin.scene.robot.footprint_radius_m + 0.09  # its raster keeps some 0.085 m more from walls
-    clear, _ = room.standing.clearance(p)
-    free = p[on_polygon(p, room.corners) & (clear > keep)]
+    clear, _ = room.obstacles.clearance(p)
+    free = p[np.minimum(room.lab.inside_m(p), clear) > keep]
     away = np.abs(path.nearest(free)[1])
     share = float((away <= 0.25).mean())
     assert share >= 0.9
