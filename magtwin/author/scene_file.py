@@ -18,8 +18,8 @@ from magtwin.errors import InputError
 from magtwin.files.file import existing_file, sha256
 from magtwin.files.kinds import expected
 from magtwin.files.settings import from_table, read_toml, refused_at
-from magtwin.path import resolve_path
 from magtwin.path.room import Room, path_in
+from magtwin.sim.motion.drive_input import check_path
 from magtwin.spec.base import ZERO3, Vec3
 from magtwin.spec.furniture import FurnitureSpec
 from magtwin.spec.lab import LabSpec, SurveySpec
@@ -373,7 +373,7 @@ def _path(path: str, folder: Path, where: str) -> str | Path:
     file = (folder / path).resolve()
     named = not Path(path).suffix and not file.exists()
     with about(f"{where} path:"):
-        resolve_path(path if named else file)
+        check_path(path if named else file)
     return path if named else file
 
 

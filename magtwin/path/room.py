@@ -140,15 +140,16 @@ def check_on_floor(path: Path, lab: LabSpec, footprint_radius_m: float) -> None:
     i = int(outside[0])
     where = f"{s[i]:.3f} m along it" if lab.floor else f"at point {i + 1} of {len(p)}"
     text = (
-        f"path {path.name} leaves the floor {where}, ({p[i, 0]:.3f}, {p[i, 1]:.3f}) m, by {beyond[i]:.3f} m"
+        f"path {path.name} leaves the floor {where}, ({p[i, 0]:.3f}, {p[i, 1]:.3f}) m, by {beyond[i]:.3f} m: "
+        f"with a robot of radius {footprint_radius_m:g} m it "
     )
     if lab.floor:
-        text += f", outside its {len(lab.floor)} corners: a robot of radius {footprint_radius_m:g} m "
-        raise InputError(f"{text}must stay that far from their border; give `fit=True`, or move its points")
+        way = "give `fit=True`, or move its points"
+        raise InputError(f"{text}must stay that far inside of its {len(lab.floor)} corners; {way}")
     needs = np.ptp(p, axis=0) + 2 * footprint_radius_m
     raise InputError(
-        f"{text}: with a robot of radius {footprint_radius_m:g} m it needs {needs[0]:.2f} x {needs[1]:.2f} m, "
-        f"the floor is {lab.size_text}; {_what_fits(path, lab.floor_m, footprint_radius_m)}"
+        f"{text}needs {needs[0]:.2f} x {needs[1]:.2f} m, the floor is {lab.size_text}; "
+        f"{_what_fits(path, lab.floor_m, footprint_radius_m)}"
     )
 
 

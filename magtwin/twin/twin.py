@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import importlib
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path as FilePath
@@ -129,6 +130,20 @@ class Twin(Summarized):
                 ("file", str(self.scene_file) if self.stage is None else "none: opened from a Scene"),
             ),
         )
+
+
+def scene_in(place: Any, what: str = "scene must be") -> Any:
+    """The scene of a `Room`; a `Scene`, a stage and the name of a file as they are.
+
+    Raises:
+        InputError: It is none of these; begins with `what`.
+    """
+    if isinstance(place, str | os.PathLike | Scene) or hasattr(place, "GetRootLayer"):
+        return place
+    if not hasattr(type(place), "scene"):
+        text = f"{what} a Scene, a Room, a stage or its file, got {type(place).__name__}"
+        raise InputError(text, parameter=what.split()[0])
+    return place.scene
 
 
 def opened(

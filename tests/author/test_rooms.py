@@ -297,5 +297,5 @@ def test_what_is_authored_draws_itself(room, tmp_path):
             patch for ax in figure.findobj(lambda each: hasattr(each, "patches")) for patch in ax.patches
         ]
         assert len(drawn) > 10  # walls and furniture
-    with pytest.raises(InputError, match="plot draws a run, a map or a scene, got int"):
+    with pytest.raises(InputError, match=r"what must be a Run, an AnomalyMap, a Scene, .* got int"):
         mt.plot(5)

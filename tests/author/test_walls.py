@@ -326,7 +326,12 @@ DOOR = '[[door]]\nwall = "a"\nat_m = 2\n'
             "from",
             "off the floor",
         ),
-        (f"floor = {CORNERS}", SHELF.format(7, 4), "p_world", "reaches 1.50 m off the floor, whose corners"),
+        (
+            f"floor = {CORNERS}",
+            SHELF.format(7, 4),
+            "p_world",
+            "reaches 1.25 m beyond the slab, which is the floor",
+        ),
         (f"floor = {CORNERS}", SHELF.format(9, 1.5), "p_world", "0.05 m deep in wall 'edge_1'"),
     ],
 )
