@@ -55,7 +55,7 @@ class Wall(Spec):
         self._above_zero("height_m", "thickness_m")
         self._not_negative("susceptibility")
         find("material", self.material, MATERIALS)
-        self._require("end", self.length_m > SAME_M, "differ from its start", self.end)
+        self._require("end", self.length_m > SAME_M, "differ from its start, `from` of a TOML", self.end)
         _check_steel(self, self.material)
 
     @property

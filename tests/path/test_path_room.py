@@ -63,6 +63,7 @@ def test_a_named_path_passes_what_stands_in_its_way(name, where):
     check_on_floor(path, where.lab, where.footprint_radius_m)
     check_clear(path, where.obstacles, where.footprint_radius_m)
     assert np.ptp(path.p_xy, axis=0).min() > 0.15 * min(where.lab.floor_m)
+    assert name != "coverage" or path.swept >= 0.9
     assert name == "coverage" or len(path.p_xy) == len(path_named(name).p_xy)
 
 

@@ -97,7 +97,7 @@ def plan_toml(path: Path, name: str, scale: float | None = None) -> tuple[str, l
             f"{path}: {len(plan.walls):,} walls, at most {MOST_WALLS:,}; leave out what is no wall"
         )
     try:
-        lab = LabSpec(floor=plan.floor, **plan.sides)
+        lab = LabSpec(floor=plan.floor, **plan.sides)  # type: ignore[arg-type]
         off = {wall.name for wall in plan.walls if off_floor_m(wall, lab)[1].min() > 0}
         if off:
             plan.notes.append(f"{len(off)} lines left out that stand off the floor")

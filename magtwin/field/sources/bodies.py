@@ -260,7 +260,9 @@ def _is_thin(half: float, distance: float, tolerance: float) -> bool:
 def _of_a_cylinder(radius: float, half: float, distance: float, tolerance: float) -> tuple[Array, Array]:
     """A rule along the axis, times one in the squared radius with evenly spaced angles."""
     disc, part = np.zeros((1, 2)), np.ones(1)
-    if _is_thin(radius, distance, tolerance) and half > radius:  # second moments are half^2 / 3 and radius^2 / 4
+    if (
+        _is_thin(radius, distance, tolerance) and half > radius
+    ):  # second moments are half^2 / 3 and radius^2 / 4
         along, share = _line(half, math.sqrt(0.75) * radius, distance, tolerance)
     else:
         along, share = _line(half, 0.0, distance, tolerance)
