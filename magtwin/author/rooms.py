@@ -81,18 +81,12 @@ class WallKeys(TypedDict, total=False):
     susceptibility: float
 
 
-class DoorKeys(TypedDict, total=False):
+class DoorKeys(WallKeys, total=False):
     """More of a door, see `Door`."""
 
-    name: str
     width_m: float
-    height_m: float
     open_deg: float
     hinge: str
-    thickness_m: float
-    material: str
-    magnetization: float
-    susceptibility: float
 
 
 class WindowKeys(TypedDict, total=False):
