@@ -175,8 +175,7 @@ class MagNavVectorEnv(VectorEnv[Any, Any, Any]):
         if not isinstance(line, Path):
             raise InputError(f"path must be a path to drive along, got {line!r}", parameter="path")
         self.path = line
-        room = twin.scene.lab
-        check_on_floor(self.path, room.floor_m, robot.footprint_radius_m, room.border)
+        check_on_floor(self.path, twin.scene.lab, robot.footprint_radius_m)
         check_clear(self.path, twin.obstacles, robot.footprint_radius_m)
         if not callable(reward):
             raise InputError(f"reward must be a function of a Transition, got {reward!r}")

@@ -16,7 +16,7 @@ from magtwin.files.settings import refused_at
 from magtwin.frames import IDENTITY_XYZW, quat_from_yaw, rotate
 from magtwin.spec.base import ZERO3, Quat, Spec, Vec3
 from magtwin.spec.furniture import BODY, FurnitureSpec, Part
-from magtwin.spec.lab import LabSpec, beyond_m
+from magtwin.spec.lab import LabSpec
 from magtwin.urdf.meshes.mesh import read_mesh
 from magtwin.usd.attributes import check_prim_name
 
@@ -184,27 +184,21 @@ def check_stands(piece: FurnitureSpec, lab: LabSpec) -> None:
     signs = np.array(np.meshgrid((-1, 1), (-1, 1), (-1, 1))).reshape(3, -1).T
     corners = np.concatenate([np.array(p.p) + signs * np.array(p.size_m) / 2 for p in piece.parts])
     world = rotate(piece.q_world_xyzw, corners) + piece.p_world
-    x0, x1, y0, y1 = lab.extent_m
-    middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2]) if lab.floor else np.zeros(2)
-    half = np.array([x1 - x0, y1 - y0]) / 2 + lab.wall_thickness_m + lab.apron_m
-    beyond = float(np.max(np.abs(world[:, :2] - middle) - half))
+    edge = lab.wall_thickness_m + lab.apron_m
+    beyond = -float(lab.inside_m(world[:, :2]).min()) - edge
     if beyond > 1e-6:
-        x, y = piece.p_world[:2]
         size, hint = np.ptp(world, axis=0), ""
         floor = "floor" if lab.floor else "floor_m"
-        about = f"({middle[0]:g}, {middle[1]:g})" if lab.floor else "the origin"
+        x, y = (side + 2 * edge for side in lab.floor_m)
+        slab = f"{x:g} x {y:g} m about the origin"
+        if lab.floor:
+            slab = f"the floor of {lab.size_text}, and {edge:g} m around it"
         if any(part.faces for part in piece.parts) and size.max() > HUGE_M:
             hint = f"; it is {size[0]:.3g} x {size[1]:.3g} m: is its file in mm? then scale = 0.001"
         raise InputError(
-            f"p_world of {piece.name!r} is ({x:g}, {y:g}): it reaches {beyond:.2f} m beyond the slab, "
-            f"which is {2 * half[0]:g} x {2 * half[1]:g} m about {about}; move it, or enlarge {floor} or "
-            f"apron_m of [lab]{hint}"
-        )
-    off = float(beyond_m(world[:, :2], lab.corners).max()) if lab.floor else 0.0
-    if off > lab.wall_thickness_m + lab.apron_m + 1e-6:
-        raise InputError(
             f"p_world of {piece.name!r} is ({piece.p_world[0]:g}, {piece.p_world[1]:g}): it reaches "
-            f"{off:.2f} m off the floor, whose corners leave that place out; move it, or change floor"
+            f"{beyond:.2f} m beyond the slab, which is {slab}; move it, or enlarge {floor} or apron_m of "
+            f"[lab]{hint}"
         )
 
 

@@ -46,8 +46,7 @@ def check_start(placed: PlacedRobot, lab: LabSpec, obstacles: Obstacles) -> None
         raise InputError(
             f"start's yaw must be in radians, at most 2 pi; {yaw:g} deg are {math.radians(yaw):.4f} rad"
         )
-    every = bool(lab.floor or lab.walls)
-    inside = [k for k, name in enumerate(obstacles.names) if every or name.startswith(str(FURNITURE))]
+    inside = [k for k, name in enumerate(obstacles.names) if lab.built or name.startswith(str(FURNITURE))]
     standing = Obstacles(
         tuple(obstacles.names[k] for k in inside), tuple(obstacles.outlines[k] for k in inside)
     )

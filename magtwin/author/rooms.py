@@ -81,18 +81,12 @@ class WallKeys(TypedDict, total=False):
     susceptibility: float
 
 
-class DoorKeys(TypedDict, total=False):
+class DoorKeys(WallKeys, total=False):
     """More of a door, see `Door`."""
 
-    name: str
     width_m: float
-    height_m: float
     open_deg: float
     hinge: str
-    thickness_m: float
-    material: str
-    magnetization: float
-    susceptibility: float
 
 
 class WindowKeys(TypedDict, total=False):
@@ -489,8 +483,7 @@ class Room(Summarized):
             ("robots", listed([robot["name"] for robot in table.get("robot", ())], 80) or "none yet"),
             ("earth", f"{earth['latitude_deg']:g}, {earth['longitude_deg']:g} deg, {earth['date']}"),
         ]
-        x0, x1, y0, y1 = lab.extent_m
-        return Summary(f"Room {table['name']}: floor {x1 - x0:g} x {y1 - y0:g} m", tuple(rows))
+        return Summary(f"Room {table['name']}: floor {lab.size_text}", tuple(rows))
 
     def _lab(self) -> LabSpec:
         """The room without what stands in it, and with its walls."""

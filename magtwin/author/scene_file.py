@@ -18,8 +18,8 @@ from magtwin.errors import InputError
 from magtwin.files.file import existing_file, sha256
 from magtwin.files.kinds import expected
 from magtwin.files.settings import from_table, read_toml, refused_at
-from magtwin.path import resolve_path
 from magtwin.path.room import Room, path_in
+from magtwin.sim.motion.drive_input import check_path
 from magtwin.spec.base import ZERO3, Vec3
 from magtwin.spec.furniture import FurnitureSpec
 from magtwin.spec.lab import LabSpec, SurveySpec
@@ -203,13 +203,13 @@ def scene_from_toml(
         if layer is None and (given.survey is None or given.survey.height_m is None):
             check_above_floor(made, where)
         drives = _path(robot_table.path, Path(path).parent, where)
-        cut = bool(lab.floor or lab.walls)  # the origin need not be free
+        cut = lab.built  # the origin need not be free
         of_robot = robot_table.start is not None or not (
             (alone and not cut) or (number == 0 and "start" in table)
         )
         start = robot_table.start or (ZERO3 if of_robot else given.start)
         if robot_table.start is None and of_robot and (drives or cut) and drives != "random":
-            room = Room(lab.floor_m, made.footprint_radius_m, standing, lab.border)
+            room = Room(lab, made.footprint_radius_m, standing)
             way = path_in(room, drives or "figure8")  # not in each other
             start = float(way.p_xy[0, 0]), float(way.p_xy[0, 1]), float(way.heading(0.0))
         robots.append(PlacedRobot(robot=made, start=start, path=drives))
@@ -373,7 +373,7 @@ def _path(path: str, folder: Path, where: str) -> str | Path:
     file = (folder / path).resolve()
     named = not Path(path).suffix and not file.exists()
     with about(f"{where} path:"):
-        resolve_path(path if named else file)
+        check_path(path if named else file)
     return path if named else file
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from magtwin.author.scene_file import PARTS
 from magtwin.files.file import shipped
 from magtwin.spec.base import KEY
+from magtwin.spec.lab import LabSpec
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import PlacedRobot
 from magtwin.spec.scene import Scene
@@ -65,13 +66,7 @@ def table_of_scene(scene: Scene) -> Table:
     if alone:
         table["start"] = robots[0].pop("start")
         del robots[0]["name"]
-    lab = table_of(scene.lab)
-    if "floor" not in lab:
-        lab["floor_m"] = list(scene.lab.floor_m)
-    table["lab"] = lab
-    for section, things in (("wall", "walls"), ("door", "doors"), ("window", "windows")):
-        if of_lab := getattr(scene.lab, things, ()):
-            table[section] = [table_of(thing) for thing in of_lab]
+    table |= tables_of_lab(scene.lab)
     if scene.earth is not None:
         table["earth"] = table_of(scene.earth)
     if scene.sources:
@@ -84,6 +79,17 @@ def table_of_scene(scene: Scene) -> Table:
             {**given, "magnetization": list(piece.magnetization)} for piece, given in pieces
         ]
     return table | {"robot": robots[0] if alone else robots}
+
+
+def tables_of_lab(lab: LabSpec) -> Table:
+    """A room as [lab], [[wall]], [[door]] and [[window]]."""
+    table: Table = {"lab": table_of(lab, leave={"floor_m"})}
+    if not lab.floor:
+        table["lab"]["floor_m"] = list(lab.floor_m)
+    for section, things in (("wall", lab.walls), ("door", lab.doors), ("window", lab.windows)):
+        if things:
+            table[section] = [table_of(thing) for thing in things]
+    return table
 
 
 def table_of(spec: Any, *, leave: "set[str] | frozenset[str]" = frozenset(), like: Any = None) -> Table:

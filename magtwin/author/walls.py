@@ -11,6 +11,7 @@ import numpy as np
 from magtwin.author.furniture import drawn_magnetization
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.files.settings import refused_at
+from magtwin.frames import rotate
 from magtwin.spec.furniture import BODY, MATERIALS, FurnitureSpec, Part
 from magtwin.spec.lab import LabSpec, off_floor_m
 from magtwin.spec.obstacles import Obstacles
@@ -114,6 +115,13 @@ def lab_with_walls(
     return made
 
 
+def _outline(piece: FurnitureSpec, part: Part) -> np.ndarray:
+    """Outline of the box of a part of a piece on the floor, shape (4, 2) [m]."""
+    signs = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
+    box = np.array(part.p) + signs * np.array(part.size_m) / 2
+    return np.asarray((rotate(piece.q_world_xyzw, box) + piece.p_world)[:, :2])
+
+
 def check_not_in_walls(
     pieces: Sequence[FurnitureSpec], lab: LabSpec, obstacles: Obstacles, path: str | os.PathLike[str]
 ) -> None:
@@ -137,8 +145,12 @@ def check_not_in_walls(
     for name, outline in placed:
         if name.startswith(f"{FURNITURE}/"):
             parts.setdefault(name.split("/")[3], []).append(outline)
-    for piece, outlines in parts.items():
-        whole = Obstacles((piece,), (np.concatenate(outlines),)).outlines  # a table's legs are beside a side
+    upper = {
+        piece.name: [_outline(piece, part) for part in piece.parts if not part.faces] for piece in pieces
+    }
+    for piece, standing in parts.items():
+        whole = Obstacles((piece,), (np.concatenate(standing),)).outlines  # a table's legs are beside a side
+        outlines = [*standing, *upper.get(piece, ())]  # with what robots pass below, such as its top
         for wall_name, wall in walls:
             inner = wall_name[0] in own
             depths = [(overlap_m(outline, wall), outline) for outline in (outlines if inner else whole)]

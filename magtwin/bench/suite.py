@@ -16,7 +16,7 @@ from magtwin.files.kinds import expected, scene_file
 from magtwin.files.settings import from_table, read_toml, refused_at
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import OdometryModel, SensorModel
-from magtwin.sim.motion.drive_input import drive_input
+from magtwin.sim.motion.drive_input import check_path
 
 HELD_OUT = 1_000_000_000
 """Added to the seed of the suite for the held-out seeds."""
@@ -354,7 +354,7 @@ class Suite:
                 if scenario.source == "twin":
                     self.scene(scenario)
                     for path in scenario.paths:
-                        drive_input(self.path(path))
+                        check_path(self.path(path))
             if scenario.data or scenario.source != "twin":
                 self.folder(scenario)
 

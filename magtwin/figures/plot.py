@@ -20,7 +20,7 @@ from magtwin.run.run import Run
 from magtwin.spec.scene import Scene
 from magtwin.twin import Twin, open_twin, scene_of
 from magtwin.twin.opening import open_unwritten
-from magtwin.twin.twin import Place
+from magtwin.twin.twin import Place, scene_in
 
 LEVEL_NT = 20.0
 """A map that varies less is drawn as a bare floor [nT]."""
@@ -121,13 +121,9 @@ def _opened(scene: Twin | Place) -> Twin:
         return scene
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MismatchWarning)
-        if not isinstance(scene, str) and hasattr(type(scene), "scene"):
-            scene = scene.scene  # type: ignore[union-attr]
+        scene = scene_in(scene, "what must be a Run, an AnomalyMap,")
         if isinstance(scene, Scene):
             return open_unwritten(scene, {}, network="none")
-        if not (isinstance(scene, str) or hasattr(scene, "GetRootLayer") or hasattr(scene, "__fspath__")):
-            kind = type(scene).__name__
-            raise InputError(f"plot draws a run, a map or a scene, got {kind}", parameter="what")
         return open_twin(scene, network="none")
 
 

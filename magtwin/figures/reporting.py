@@ -81,9 +81,12 @@ def report_scene(scene: Path, out: Source, *, force: bool = False) -> Path:
         told = read_scene(scene, check_network=False)
         field = load_map(told.map_layer)
         names = ", ".join(placed.robot.name for placed in told.robots)
-        x, y = told.lab.floor_m
         cell, least, most = field.cell_m, *(float(f(field.values_nt[field.valid])) for f in (min, max))
-        figures = [("floor", f"{x:g} × {y:g} m"), ("robot", names), ("map", span(least, most, "nT"))]
+        figures = [
+            ("floor", told.lab.size_text.replace(" x ", " × ")),
+            ("robot", names),
+            ("map", span(least, most, "nT")),
+        ]
         figures += [("cells", f"{cell[0]:g} × {cell[1]:g} m"), ("headings", f"{len(field.headings_rad)}")]
         lead = f"The scene {told.name} and its map {field.name}, at the heading of the slider."
     except InputError as error:

@@ -20,7 +20,7 @@ from magtwin.path.room import FLOOR_M
 from magtwin.run.run import Run
 from magtwin.run.summary import swept
 from magtwin.sim.motion.commands import Commands, read_commands
-from magtwin.sim.motion.drive_input import drive_input, path_metadata
+from magtwin.sim.motion.drive_input import check_path, drive_input, path_metadata
 from magtwin.spec.plant import PlantSpec
 from magtwin.twin import Session, Twin, in_session, open_twin, room_of, scan, simulate, with_plant
 
@@ -88,7 +88,7 @@ def drive(
     about what is driven otherwise than it was asked for. `options` are those of `magtwin.open_twin` and
     `magtwin.simulate`.
     """
-    drive_input(path)  # refuses a wrong name before the scene is opened
+    check_path(path)
     twin = open_twin(scene_file, **{name: options.pop(name) for name in OPENING if name in options})
     twin = in_session(with_plant(twin, plant), session, seed=seed)
     what = drive_input(path, room_of(twin), fit=fit)

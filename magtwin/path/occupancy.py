@@ -12,7 +12,6 @@ from magtwin.errors import InputError
 from magtwin.files.outputs import check_free, output, transaction
 from magtwin.path.room import Room
 from magtwin.report.summary import Summarized, Summary
-from magtwin.spec.lab import on_polygon
 from magtwin.spec.obstacles import Obstacles
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
@@ -121,11 +120,8 @@ def occupancy_of(room: Room, *, resolution_m: float | None = None) -> OccupancyG
         )
     columns, rows = count.astype(int).tolist()
     x, y = ((low[k] + np.arange(n) + 0.5) * resolution_m for k, n in enumerate((columns, rows)))
-    half = np.asarray(room.floor_m) / 2
-    on_floor = (np.abs(y) <= half[1])[:, None] & (np.abs(x) <= half[0])[None, :]
-    if room.corners:
-        at = np.stack(np.meshgrid(x, y), axis=-1)
-        on_floor = on_polygon(at.reshape(-1, 2), room.corners).reshape(at.shape[:2])
+    at = np.stack(np.meshgrid(x, y), axis=-1)
+    on_floor = (room.lab.inside_m(at.reshape(-1, 2)) >= 0).reshape(at.shape[:2])
     cells = np.where(on_floor, FREE, UNKNOWN).astype(np.int8)
     for name, outline in zip(room.obstacles.names, room.obstacles.outlines, strict=True):
         first = (np.floor(outline.min(axis=0) / resolution_m - low) - 1).astype(int)
@@ -143,8 +139,7 @@ def occupancy_of(room: Room, *, resolution_m: float | None = None) -> OccupancyG
 
 def _extent(room: Room, resolution_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Lower left corner, in cells, and numbers of columns and rows, with two cells more on each side."""
-    half = np.asarray(room.floor_m) / 2
-    corners = np.concatenate([room.corners or [-half, half], *room.obstacles.outlines])
+    corners = np.concatenate([room.lab.corners, *room.obstacles.outlines])
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         low = np.floor(corners.min(axis=0) / resolution_m - 1e-9) - 2
         return low, np.ceil(corners.max(axis=0) / resolution_m + 1e-9) + 2 - low

@@ -1,6 +1,5 @@
 """The room of a path: checks on floor and obstacles, and fitting a path to them."""
 
-import functools
 import math
 import os
 import warnings
@@ -15,8 +14,7 @@ from magtwin.path.coverage import cover
 from magtwin.path.curves import CASES, PATHS, path_named
 from magtwin.path.points import resolve_path
 from magtwin.path.polyline import Path
-from magtwin.spec.base import Vec2
-from magtwin.spec.lab import on_polygon
+from magtwin.spec.lab import LabSpec
 from magtwin.spec.obstacles import Obstacles
 
 Array = NDArray[np.float64]
@@ -33,7 +31,6 @@ LEAST_SCALE = 0.1  # Below this scale, a path that is too large is taken for one
 COVERAGE = "coverage"  # Name of the path that is planned for a room
 STRIP_M = 0.5  # Distance between strips of that path [m]
 PLAN_STEP_M = 0.05  # Spacing of the raster on which it is planned [m]
-FENCE_M = 0.001  # Thickness of the border of a floor with corners [m]
 SWEPT = 0.8  # Least share of the free floor around a scaled path that is not told of
 FEW_CELLS = 4_000  # Cells of a raster of which only shares are told
 LITTLE_M2 = 0.1  # A smaller part of the free floor is not told of [m2]
@@ -44,26 +41,15 @@ SHIFTS = 13  # Positions to try along each axis for each size
 class Room:
     """A floor with obstacles, and the robot that drives on it."""
 
-    floor_m: tuple[float, float]  # Extent of the floor in x and y, centred on the world's origin [m]
+    lab: LabSpec  # The floor
     footprint_radius_m: float  # Radius of the robot [m]
     obstacles: Obstacles  # Obstacles in the room
-    corners: tuple[Vec2, ...] = ()  # Corners of the floor [m], counter-clockwise; () for the rectangle
-
-    @functools.cached_property
-    def standing(self) -> Obstacles:
-        """The obstacles, and the border of a floor with corners."""
-        if not self.corners:
-            return self.obstacles
-        sides = zip(self.corners, (*self.corners[1:], self.corners[0]), strict=True)
-        fence = [_fence(*side) for side in sides]
-        names = [f"the border of the floor, edge_{k}" for k in range(len(fence))]
-        return Obstacles((*self.obstacles.names, *names), (*self.obstacles.outlines, *fence))
 
     def refusal(self, path: Path) -> InputError | None:
         """The error if the robot cannot drive the path here; None if it can."""
         try:
-            check_on_floor(path, self.floor_m, self.footprint_radius_m, self.corners)
-            check_clear(path, self.standing, self.footprint_radius_m)
+            check_on_floor(path, self.lab, self.footprint_radius_m)
+            check_clear(path, self.obstacles, self.footprint_radius_m)
         except InputError as error:
             return error
         return None
@@ -76,19 +62,12 @@ class Room:
     @property
     def half_m(self) -> Array:
         """Half the size of the floor, or of the rectangle around its corners, in x and y [m], shape (2,)."""
-        return np.ptp(self.corners, axis=0) / 2 if self.corners else np.asarray(self.floor_m) / 2
+        return np.ptp(self.lab.corners, axis=0) / 2
 
     @property
     def middle_m(self) -> Array:
         """Its middle in world [m], shape (2,)."""
-        return np.asarray(self.corners).min(axis=0) + self.half_m if self.corners else np.zeros(2)
-
-
-def _fence(a: Vec2, b: Vec2) -> Array:
-    """Outline of a thin wall outside the side of a floor from a to b [m], shape (4, 2)."""
-    p, q = np.asarray(a), np.asarray(b)
-    out = np.array([q[1] - p[1], p[0] - q[0]]) * FENCE_M / math.dist(a, b)
-    return np.array([p, q, q + out, p + out])
+        return np.asarray(self.lab.corners).min(axis=0) + self.half_m
 
 
 def path_in(room: Room, path: str | os.PathLike[str]) -> Path:
@@ -110,14 +89,14 @@ def path_in(room: Room, path: str | os.PathLike[str]) -> Path:
     if text == COVERAGE:
         return _covering(room)
     named = path_named(text)
-    if tuple(room.floor_m) == FLOOR_M and not room.corners and room.refusal(named) is None:
+    if room.lab.floor_m == FLOOR_M and not room.lab.floor and room.refusal(named) is None:
         return named
     made_for = np.asarray(FLOOR_M) / 2 - RADIUS_M
     if min(room.reach_m) <= 0:
         raise InputError(f"path {named.name} does not fit: {_too_small(room)}")
     whole = room.reach_m / made_for
     placed = _placed(named, room, whole, each_way=True)
-    if not room.corners and placed.placing == (*whole.tolist(), 0.0, 0.0):
+    if not room.lab.floor and placed.placing == (*whole.tolist(), 0.0, 0.0):
         return placed  # as large as the floor
     return replace(placed, swept=_swept(placed, named, room))
 
@@ -142,42 +121,36 @@ def fit_path(path: Path, room: Room) -> Path:
     return _placed(path, room, np.array([whole, whole]), each_way=False)
 
 
-def check_on_floor(
-    path: Path, floor_m: tuple[float, float], footprint_radius_m: float, corners: tuple[Vec2, ...] = ()
-) -> None:
-    """Check that a round robot on the path stays on a floor centred on the world's origin, or with corners.
+def check_on_floor(path: Path, lab: LabSpec, footprint_radius_m: float) -> None:
+    """Check that a round robot on the path stays on the floor of a room.
 
     Args:
         path: Path of its centre.
-        floor_m: Extent of the floor in x and y [m].
+        lab: The room.
         footprint_radius_m: Radius of the robot [m].
-        corners: Corners of a floor that is no rectangle [m]; only the path itself must then be inside of it.
 
     Raises:
         InputError: It does not; the text has the first such point and what would fit.
     """
-    outside = np.flatnonzero(~on_polygon(path.p_xy, corners)) if corners else np.empty(0)
-    if len(outside):
-        i = int(outside[0])
-        x, y = path.p_xy[i]
-        raise InputError(
-            f"path {path.name} leaves the floor at point {i + 1} of {len(path.p_xy)}, ({x:.3f}, {y:.3f}) m, "
-            f"outside its {len(corners)} corners; give `fit=True`, or move its points"
-        )
-    if corners:
-        return
-    beyond = np.max(np.abs(path.p_xy) + footprint_radius_m - np.array(floor_m) / 2, axis=1)
+    s, p = _along(path, footprint_radius_m) if lab.floor else (path.s, path.p_xy)
+    beyond = footprint_radius_m - lab.inside_m(p)
     outside = np.flatnonzero(beyond > 1e-9)
-    if len(outside):
-        i = int(outside[0])
-        x, y = path.p_xy[i]
-        needs = np.ptp(path.p_xy, axis=0) + 2 * footprint_radius_m
-        raise InputError(
-            f"path {path.name} leaves the floor at point {i + 1} of {len(beyond)}, ({x:.3f}, {y:.3f}) m, by "
-            f"{beyond[i]:.3f} m: with a robot of radius {footprint_radius_m:g} m it needs {needs[0]:.2f} x "
-            f"{needs[1]:.2f} m, the floor is {floor_m[0]:g} x {floor_m[1]:g} m; "
-            f"{_what_fits(path, floor_m, footprint_radius_m)}"
-        )
+    if not len(outside):
+        return
+    i = int(outside[0])
+    where = f"{s[i]:.3f} m along it" if lab.floor else f"at point {i + 1} of {len(p)}"
+    text = (
+        f"path {path.name} leaves the floor {where}, ({p[i, 0]:.3f}, {p[i, 1]:.3f}) m, by {beyond[i]:.3f} m: "
+        f"with a robot of radius {footprint_radius_m:g} m it "
+    )
+    if lab.floor:
+        way = "give `fit=True`, or move its points"
+        raise InputError(f"{text}must stay that far inside of its {len(lab.floor)} corners; {way}")
+    needs = np.ptp(p, axis=0) + 2 * footprint_radius_m
+    raise InputError(
+        f"{text}needs {needs[0]:.2f} x {needs[1]:.2f} m, the floor is {lab.size_text}; "
+        f"{_what_fits(path, lab.floor_m, footprint_radius_m)}"
+    )
 
 
 def _what_fits(path: Path, floor_m: tuple[float, float], footprint_radius_m: float) -> str:
@@ -196,6 +169,13 @@ def _what_fits(path: Path, floor_m: tuple[float, float], footprint_radius_m: flo
     return f"scaled by {math.floor(scale * 100) / 100:g} it fits the floor: give `fit=True`, or enlarge it"
 
 
+def _along(path: Path, footprint_radius_m: float) -> tuple[Array, Array]:
+    """Lengths along a path (N,) [m], a quarter of the radius apart at most, and its points there (N, 2)."""
+    step = max(footprint_radius_m / 4, path.length / 100_000)  # segments may be long
+    s = np.union1d(np.linspace(0.0, path.length, math.ceil(path.length / step) + 1), path.s)
+    return s, path.at(np.minimum(s, path.length))
+
+
 def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> None:
     """Check that a round robot on the path touches no obstacle.
 
@@ -207,9 +187,7 @@ def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> 
     Raises:
         InputError: It touches one; the text has the first such point and the obstacle.
     """
-    step = max(footprint_radius_m / 4, path.length / 100_000)  # segments may be long
-    s = np.union1d(np.linspace(0.0, path.length, math.ceil(path.length / step) + 1), path.s)
-    p = path.at(np.minimum(s, path.length))
+    s, p = _along(path, footprint_radius_m)
     distance, which = obstacles.clearance(p, reach_m=footprint_radius_m)
     touched = np.flatnonzero(distance < footprint_radius_m - 1e-9)
     if len(touched):
@@ -224,8 +202,9 @@ def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> 
 
 
 def _too_small(room: Room) -> str:
-    x, y = 2 * room.half_m
-    return f"the floor of {x:g} x {y:g} m is no wider than a robot of radius {room.footprint_radius_m:g} m"
+    return (
+        f"the floor of {room.lab.size_text} is no wider than a robot of radius {room.footprint_radius_m:g} m"
+    )
 
 
 def _placed(path: Path, room: Room, whole: Array, *, each_way: bool) -> Path:
@@ -250,8 +229,8 @@ def _placed(path: Path, room: Room, whole: Array, *, each_way: bool) -> Path:
                 if room.refusal(found) is None:
                     return found
     raise InputError(
-        f"path {path.name} does not fit between the obstacles on the floor of {2 * room.half_m[0]:g} x "
-        f"{2 * room.half_m[1]:g} m, not even at a quarter of its size; move the furniture, or give your "
+        f"path {path.name} does not fit between the obstacles on the floor of {room.lab.size_text}, "
+        f"not even at a quarter of its size; move the furniture, or give your "
         "own points in a CSV file"
     )
 
@@ -311,7 +290,7 @@ def coverage(*, length_m: float = 6.0, width_m: float = 3.5, footprint_radius_m:
         width_m: Its width along y [m].
         footprint_radius_m: Radius of the robot [m].
     """
-    return _covering(Room((length_m, width_m), footprint_radius_m, Obstacles()))
+    return _covering(Room(LabSpec(floor_m=(length_m, width_m)), footprint_radius_m, Obstacles()))
 
 
 def _closed_by(room: Room, x: float, y: float) -> str:
@@ -332,7 +311,7 @@ def _swept(path: Path, named: Path, room: Room) -> float:
 
     The floor around a path is that inside its convex hull, and up to half a strip outside.
     """
-    made_for = Room(FLOOR_M, RADIUS_M, Obstacles())
+    made_for = Room(LabSpec(floor_m=FLOOR_M), RADIUS_M, Obstacles())
     return round(min(1.0, _around(path, room) / max(_around(named, made_for), 1e-9)), 3)
 
 
@@ -356,19 +335,18 @@ class _Free:
         axes = [m + np.arange(-h, h + self.step_m, self.step_m) for m, h in zip(middle, half, strict=True)]
         at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         inner = half - 1e-6  # an outline that only touches the floor's edge is outside
-        pairs = zip(room.standing.names, room.standing.outlines, strict=True)
-        inside = [
+        kept = [
             pair
-            for pair in pairs
-            if room.corners or (np.all(pair[1].max(0) > -inner) and np.all(pair[1].min(0) < inner))
+            for pair in zip(room.obstacles.names, room.obstacles.outlines, strict=True)
+            if room.lab.floor or (np.all(pair[1].max(0) > -inner) and np.all(pair[1].min(0) < inner))
         ]
-        standing = Obstacles(tuple(name for name, _ in inside), tuple(outline for _, outline in inside))
+        standing = Obstacles(tuple(name for name, _ in kept), tuple(outline for _, outline in kept))
         # A point is at most this far from the nearest node of the raster.
         needed = room.footprint_radius_m + clear_m + self.step_m / math.sqrt(2)
         distance, _ = standing.clearance(at.reshape(-1, 2), reach_m=needed)
+        if room.lab.floor:
+            distance = np.minimum(distance, room.lab.inside_m(at.reshape(-1, 2)))
         self.free: NDArray[np.bool_] = (distance >= needed).reshape(at.shape[:2])
-        if room.corners:
-            self.free &= on_polygon(at.reshape(-1, 2), room.corners).reshape(at.shape[:2])
 
     def inside(self, room: Room, clear_m: float) -> NDArray[np.bool_]:
         """The free places at which the robot is on the floor, and `clear_m` from its border."""

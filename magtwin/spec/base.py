@@ -6,6 +6,7 @@ is checked when the spec is made. Lengths are metres, angles radians, fields nT.
 
 import functools
 import math
+import re
 import types
 import typing
 from dataclasses import MISSING, Field, fields, is_dataclass
@@ -93,7 +94,8 @@ class Spec:
 
     def _require(self, name: str, holds: bool, what: str, value: Any) -> None:
         if not holds:
-            kind = type(self).__name__.lstrip("_")
+            kind = re.sub(r"Spec$|Table$|Settings$", "", type(self).__name__.lstrip("_"))
+            kind = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", kind).lower()  # as in a TOML
             raise InputError(f"{name} of {kind} must {what}, got {value!r}")
 
     def _above_zero(self, *names: str) -> None:

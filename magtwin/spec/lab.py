@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.spec.base import KEY, LATER, Spec, Vec2
@@ -86,17 +86,31 @@ class LabSpec(Spec):
         return min(xs), max(xs), min(ys), max(ys)
 
     @property
+    def size_text(self) -> str:
+        """Size of the floor, and of one with corners how many and its area."""
+        x0, x1, y0, y1 = self.extent_m
+        more = f", {len(self.floor)} corners, {abs(area_m2(self.floor)):.4g} m2" if self.floor else ""
+        return f"{x1 - x0:g} x {y1 - y0:g} m{more}"
+
+    def inside_m(self, p_xy: ArrayLike) -> NDArray[np.float64]:
+        """How far points (N, 2) are from the border of the floor [m], below 0 off it, shape (N,)."""
+        p = np.asarray(p_xy, float)
+        if self.floor:
+            return inside_m(p, self.floor)
+        return np.asarray(np.min(np.array(self.floor_m) / 2 - np.abs(p), axis=-1))
+
+    @property
+    def built(self) -> bool:
+        """Whether there is more than the sides of a rectangle: corners, walls or doors."""
+        return bool(self.floor or self.walls or self.doors)
+
+    @property
     def corners(self) -> tuple[Vec2, ...]:
         """Corners of the floor, counter-clockwise [m]."""
         if self.floor:
             return self.floor if area_m2(self.floor) > 0 else self.floor[::-1]
         x0, x1, y0, y1 = self.extent_m
         return (x0, y0), (x1, y0), (x1, y1), (x0, y1)
-
-    @property
-    def border(self) -> tuple[Vec2, ...]:
-        """Corners of a floor that has them, counter-clockwise [m]; () for a rectangle about the origin."""
-        return self.corners if self.floor else ()
 
     @property
     def sides(self) -> tuple[Wall, ...]:
@@ -151,14 +165,14 @@ def on_polygon(p_xy: NDArray[np.float64], corners: Sequence[Vec2]) -> NDArray[np
     return inside | border
 
 
-def beyond_m(p_xy: NDArray[np.float64], corners: Sequence[Vec2]) -> NDArray[np.float64]:
-    """Distance of points (N, 2) from a polygon [m], 0 in it, shape (N,)."""
-    ends = np.array(corners, float)
-    side = np.roll(ends, -1, axis=0) - ends
-    to = p_xy[:, None] - ends
-    along = np.clip((to * side).sum(axis=2) / (side**2).sum(axis=1), 0, 1)
-    away = np.hypot(*np.moveaxis(to - along[..., None] * side, 2, 0)).min(axis=1)
-    return np.where(on_polygon(p_xy, corners), 0.0, away)
+def inside_m(p_xy: NDArray[np.float64], corners: Sequence[Vec2]) -> NDArray[np.float64]:
+    """Distance of points (N, 2) from the border of a polygon [m], below 0 outside of it, shape (N,)."""
+    away = np.full(len(p_xy), np.inf)
+    for start, end in zip(np.array(corners, float), np.roll(corners, -1, axis=0), strict=True):
+        side, to = end - start, p_xy - start
+        along = np.clip(to @ side / (side @ side), 0, 1)
+        away = np.minimum(away, np.hypot(*(to - along[:, None] * side).T))
+    return np.where(on_polygon(p_xy, corners), away, -away)
 
 
 def off_floor_m(wall: Wall, lab: LabSpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -168,7 +182,7 @@ def off_floor_m(wall: Wall, lab: LabSpec) -> tuple[NDArray[np.float64], NDArray[
     """
     far = np.linspace(0, wall.length_m, max(3, int(wall.length_m / STEP_M)))
     p_xy = np.array([wall.at(float(s), 0.0) for s in far])
-    off = beyond_m(p_xy, lab.corners)
+    off = -inside_m(p_xy, lab.corners)
     slab = lab.wall_thickness_m + lab.apron_m + wall.thickness_m / 2 + SAME_M
     return p_xy, np.where(off > slab, off, 0.0)
 

@@ -108,11 +108,10 @@ class Scene(Summarized, Spec):
 
     def _summary(self) -> Summary:
         """Name and floor; robots; map; field; paths; furniture."""
-        x0, x1, y0, y1 = self.lab.extent_m
         robots = [f"{p.robot.name} ({p.robot.magnetometer.kind} magnetometer)" for p in self.robots]
         field = "no Earth's field" if self.earth is None else f"Earth's field of {self.earth.date}"
         return Summary(
-            f"Scene {self.name}: floor {x1 - x0:g} x {y1 - y0:g} m",
+            f"Scene {self.name}: floor {self.lab.size_text}",
             (
                 ("robots" if self.others else "robot", listed(robots, 80)),
                 ("map", str(self.map_layer)),

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -55,7 +55,7 @@ class Wall(Spec):
         self._above_zero("height_m", "thickness_m")
         self._not_negative("susceptibility")
         find("material", self.material, MATERIALS)
-        self._require("end", self.length_m > SAME_M, "differ from its start", self.end)
+        self._require("end", self.length_m > SAME_M, "differ from its start, `from` of a TOML", self.end)
         _check_steel(self, self.material)
 
     @property
@@ -301,8 +301,7 @@ class Structure:
 
     def openings(self, wall: Wall | None = None) -> tuple[Door | Window, ...]:
         """Doors and windows in a wall, or all of them."""
-        every: tuple[Door | Window, ...] = (*self.doors, *self.windows)
-        return tuple(each for each in every if wall is None or each.wall == wall.name)
+        return (*self.doors, *self.windows) if wall is None else tuple(self._within.get(wall.name, ()))
 
     def magnetic(self) -> list[Wall | Door | Window]:
         """What makes a field: walls of steel with their openings, and doors of steel."""
@@ -319,9 +318,18 @@ class Structure:
                 yield from self._misplaced("door", number, opening)
             else:
                 yield from self._misplaced("window", number - len(self.doors), opening)
-        for number, wall in enumerate(self.walls):
-            for opening in self.openings():
-                if opening.wall != wall.name and _crosses(wall, self.wall_of(opening), opening):
+        yield from self._crossed()
+
+    def _crossed(self) -> Iterator[Fault]:
+        """Walls that stand in an opening of another wall; touching is not standing in it."""
+        openings, none = self.openings(), np.empty((0, 4, 2))
+        holes = np.array([_hole(self.wall_of(each), each) for each in openings]) if openings else none
+        low, high = holes.min(axis=1) - SAME_M, holes.max(axis=1) + SAME_M
+        for number, wall in enumerate(self.walls if openings else ()):
+            corners = corners_of(wall)
+            near = np.all((np.min(corners, axis=0) < high) & (np.max(corners, axis=0) > low), axis=1)
+            for opening, hole in ((openings[k], holes[k]) for k in np.flatnonzero(near)):
+                if opening.wall != wall.name and overlap_m(corners, hole) > SAME_M:
                     x, y = self.wall_of(opening).at(opening.at_m)
                     text = (
                         f"wall {wall.name!r} crosses {opening.name!r} of wall {opening.wall!r} at "
@@ -329,13 +337,25 @@ class Structure:
                     )
                     yield "wall", number, "from", text
 
+    @cached_property
+    def _known(self) -> dict[str, Wall]:
+        return {wall.name: wall for wall in (*self.walls, *self.sides)}
+
+    @cached_property
+    def _within(self) -> dict[str, list[Door | Window]]:
+        """Doors and windows by the name of their wall."""
+        within = dict[str, list[Door | Window]]()
+        for each in self.openings():
+            within.setdefault(str(each.wall), []).append(each)
+        return within
+
     def wall_of(self, opening: Door | Window) -> Wall:
         """The wall of an opening.
 
         Raises:
             InputError: There is no such wall.
         """
-        return find("wall", str(opening.wall), {each.name: each for each in (*self.walls, *self.sides)})
+        return find("wall", str(opening.wall), self._known)
 
     def _names(self) -> Iterator[Fault]:
         taken = {wall.name.casefold() for wall in self.sides}
@@ -355,7 +375,7 @@ class Structure:
                 taken.add(thing.name.casefold())
 
     def _misplaced(self, section: str, number: int, opening: Door | Window) -> Iterator[Fault]:
-        known = [wall.name for wall in (*self.walls, *self.sides)]
+        known = self._known
         if opening.wall not in known:
             more = hint(str(opening.wall), known) if known else "the room has none; add a [[wall]]"
             yield section, number, "wall", f"no wall {opening.wall!r} for {opening.name!r}: {more}"
@@ -400,12 +420,10 @@ class Structure:
             raise InputError(f"[[{section}]] {number}: {text}")
 
 
-def _crosses(wall: Wall, through: Wall, opening: Door | Window) -> bool:
-    """Whether a wall stands in an opening of another wall; touching is not standing in it."""
-    half = through.thickness_m / 2
-    first, last = opening.span_m
-    hole = [through.at(s, d) for s, d in ((first, -half), (last, -half), (last, half), (first, half))]
-    return overlap_m(corners_of(wall), hole) > SAME_M
+def _hole(wall: Wall, opening: Door | Window) -> list[Vec2]:
+    """Corners of an opening in a wall on the floor."""
+    (first, last), half = opening.span_m, wall.thickness_m / 2
+    return [wall.at(s, d) for s, d in ((first, -half), (last, -half), (last, half), (first, half))]
 
 
 def corners_of(wall: Wall) -> list[Vec2]:

@@ -320,11 +320,10 @@ def live_problem(
         belief = None if str(anomaly_map) == "none" else open_map(anomaly_map)
     elif anomaly_map is not None:
         belief = anomaly_map
-    x, y = (side / 2 for side in twin.scene.lab.floor_m)
     arm = tuple(twin.scene.robot.p_base_magnetometer[:2])
     return Problem(
         belief=belief,
-        extent=belief.extent if isinstance(belief, AnomalyMap) else (-x, x, -y, y),
+        extent=belief.extent if isinstance(belief, AnomalyMap) else twin.scene.lab.extent_m,
         sensor=replace(ROBOT_NOISE, **{"lever_arm_m": arm, **(sensor or {})}),
         odometry=odometry or OdometryModel(),
         map_length_m=map_length_m,

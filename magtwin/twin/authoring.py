@@ -222,16 +222,10 @@ def author_scene(
         raise InputError(
             "map_layer and network are for a TOML; use with_() on a Scene", parameter="map_layer"
         )
-    made = scene if isinstance(scene, Scene) else _made(scene)
+    made = importlib.import_module("magtwin.twin.twin").scene_in(scene)
+    if hasattr(made, "GetRootLayer"):
+        made = importlib.import_module("magtwin").read_scene(made)
     return Authored(write_scene(made, out, force=force))
-
-
-def _made(scene: Any) -> Scene:
-    if hasattr(scene, "GetRootLayer"):
-        return importlib.import_module("magtwin").read_scene(scene)  # type: ignore[no-any-return]
-    if not hasattr(type(scene), "scene"):
-        raise InputError(f"scene must be a Scene, a Room, a stage or a TOML, got {type(scene).__name__}")
-    return scene.scene  # type: ignore[no-any-return]
 
 
 def new_scene(

@@ -22,7 +22,7 @@ from magtwin.sim.survey import survey as survey_nodes
 from magtwin.spec.lab import SurveySpec
 from magtwin.spec.scene import Scene
 from magtwin.twin.opening import open_twin
-from magtwin.twin.twin import Place, Twin
+from magtwin.twin.twin import Place, Twin, scene_in
 from magtwin.usd.layers import check_not_part, layer_files
 from magtwin.usd.maps.layer import save_map
 from magtwin.usd.scene import open_scene, use_map
@@ -49,8 +49,7 @@ def survey(scene: Twin | Place, *, seed: int = 0, **survey: Any) -> AnomalyMap:
         InputError: The scene has no Earth field, or a number is out of range.
     """
     spec = from_values(SurveySpec, survey, "survey")
-    if hasattr(type(scene), "scene") and not isinstance(scene, str | os.PathLike):  # a room
-        scene = scene.scene  # type: ignore[union-attr]
+    scene = scene if isinstance(scene, Twin) else scene_in(scene)
     if isinstance(scene, Scene):
         obstacles = importlib.import_module("magtwin.author.room").obstacles_in(scene.lab, scene.furniture)
     else:

@@ -25,6 +25,7 @@ from magtwin.twin.twin import (
     Network,
     Place,
     Twin,
+    scene_in,
     scene_sha256,
     without_tracking_error,
 )
@@ -89,13 +90,7 @@ def open_twin(
     network = _weights_file(network)
     options: Any = {"network": network, "magnetometer": magnetometer, "model_error": model_error}
     options["tracking_error"] = tracking_error
-    if not isinstance(scene, str | FilePath | Scene) and not hasattr(scene, "GetRootLayer"):
-        if not hasattr(type(scene), "scene"):
-            kind = type(scene).__name__
-            raise InputError(
-                f"scene must be a Scene, a Room, a stage or its file, got {kind}", parameter="scene"
-            )
-        scene = scene.scene  # type: ignore[union-attr]
+    scene = scene_in(scene)
     if isinstance(scene, Scene):
         return _open_in_memory(scene, map_layer=map_layer, **options)  # has one lab
     from magtwin.usd.scene import open_scene, saved_as

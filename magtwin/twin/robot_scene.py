@@ -105,7 +105,7 @@ def _with_path(scene: Scene) -> Scene:
     robot, obstacles = scene.robot, obstacles_in(scene.lab, scene.furniture)
     if scene.path:
         return scene
-    room = Room(scene.lab.floor_m, robot.footprint_radius_m, obstacles, scene.lab.border)
+    room = Room(scene.lab, robot.footprint_radius_m, obstacles)
     for path in PATHS:
         with suppress(InputError):
             way = path_in(room, path)

@@ -119,5 +119,4 @@ def trained_on(twin: Twin) -> bool:
 
 def room_of(twin: Twin) -> Room:
     """The floor, footprint and obstacles that a path of the first robot must fit."""
-    lab, radius = twin.scene.lab, twin.scene.robot.footprint_radius_m
-    return Room(lab.floor_m, radius, twin.obstacles, lab.border)
+    return Room(twin.scene.lab, twin.scene.robot.footprint_radius_m, twin.obstacles)

@@ -28,6 +28,7 @@ from magtwin.twin.twin import (
     Twin,
     checked_seed,
     opened,
+    scene_in,
     scene_sha256,
     without_model_error,
 )
@@ -184,9 +185,7 @@ def _bases(twins: Any, network: Network, magnetometer: Kind | None, model_error:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
-                scene = (
-                    each.scene if hasattr(type(each), "scene") and not isinstance(each, FilePath) else each
-                )
+                scene = each if isinstance(each, Twin) else scene_in(each)
                 if isinstance(scene, Scene):
                     options: Any = {"network": network, "magnetometer": magnetometer}
                     open_unwritten = importlib.import_module("magtwin.twin.opening").open_unwritten

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import importlib
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path as FilePath
@@ -119,10 +120,9 @@ class Twin(Summarized):
         plant = self.metadata.get("plant", OF_SCENE if robot.plant != PlantSpec() else "")
         sensor += f", plant {plant}" if plant else ""
         more = f", and {len(self.scene.others)} more robots" if self.scene.others else ""
-        x0, x1, y0, y1 = self.scene.lab.extent_m
         network = self.magnetometer._summary().title.partition(" ")[2] if self.magnetometer else "none"
         return Summary(
-            f"Twin {self.scene.name}: floor {x1 - x0:g} x {y1 - y0:g} m, {len(self.obstacles)} obstacles",
+            f"Twin {self.scene.name}: floor {self.scene.lab.size_text}, {len(self.obstacles)} obstacles",
             (
                 ("robot", sensor + more + (f", session {self.session['session']}" if self.session else "")),
                 ("map", field.title.partition(" ")[2]),
@@ -130,6 +130,20 @@ class Twin(Summarized):
                 ("file", str(self.scene_file) if self.stage is None else "none: opened from a Scene"),
             ),
         )
+
+
+def scene_in(place: Any, what: str = "scene must be") -> Any:
+    """The scene of a `Room`; a `Scene`, a stage and the name of a file as they are.
+
+    Raises:
+        InputError: It is none of these; begins with `what`.
+    """
+    if isinstance(place, str | os.PathLike | Scene) or hasattr(place, "GetRootLayer"):
+        return place
+    if not hasattr(type(place), "scene"):
+        text = f"{what} a Scene, a Room, a stage or its file, got {type(place).__name__}"
+        raise InputError(text, parameter=what.split()[0])
+    return place.scene
 
 
 def opened(

@@ -82,7 +82,7 @@ def lab_of(toml) -> LabSpec:
 
 
 def covered(lab: LabSpec) -> float:
-    room = Room(lab.floor_m, 0.171, obstacles_in(lab, ()), lab.corners)
+    room = Room(lab, 0.171, obstacles_in(lab, ()))
     path = path_in(room, "coverage")
     assert room.refusal(path) is None
     return path.swept
@@ -161,7 +161,7 @@ def test_an_occupancy_map_becomes_the_room_that_it_shows(tmp_path, yaw):
         walls=(Wall((0, 3), (4, 3)),),
         doors=(Door(0, 2, material="none"),),
     )
-    grid = occupancy_of(Room(made.floor_m, 0.171, obstacles_in(made, ()), made.corners))
+    grid = occupancy_of(Room(made, 0.171, obstacles_in(made, ())))
     file, _ = grid.save(tmp_path / "map.yaml")
     file.write_text(file.read_text(encoding="utf-8").replace("0.0]", f"{yaw}]"), encoding="utf-8")
     lab = lab_of(new_scene(tmp_path / "room.toml", plan=tmp_path / "map.pgm"))

@@ -174,6 +174,7 @@ def test_each_call_leaves_the_room_as_it_was():
         (lambda room: room.robot("turtelbot4"), "no robot 'turtelbot4'; known: turtlebot4"),
         (lambda room: room.robot(wheels=3), "no part 'wheels'"),
         (lambda room: room.robot(at=(9, 9)).scene, "off the floor.*is free"),
+        (lambda room: room.door(2, "south").robot(at=(-1.45, -1.3)).scene, "is in 'door_0'; .* is free"),
         (lambda room: room.robot().robot(name="turtlebot4"), "called 'turtlebot4'"),
         (lambda room: mt.simulate(room), r"has no robot; add one: .robot"),
         (lambda room: mt.open_twin(5), "scene must be a Scene, a Room"),
@@ -297,5 +298,5 @@ def test_what_is_authored_draws_itself(room, tmp_path):
             patch for ax in figure.findobj(lambda each: hasattr(each, "patches")) for patch in ax.patches
         ]
         assert len(drawn) > 10  # walls and furniture
-    with pytest.raises(InputError, match="plot draws a run, a map or a scene, got int"):
+    with pytest.raises(InputError, match=r"what must be a Run, an AnomalyMap, a Scene, .* got int"):
         mt.plot(5)

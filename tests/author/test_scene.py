@@ -536,7 +536,7 @@ def test_a_twin_loads_a_network_only_for_a_neural_magnetometer(lab_scene, tmp_pa
     assert open_twin(lab_scene, network="none").scene.robot.magnetometer.kind == "physical"
     with pytest.raises(InputError, match="a neural magnetometer without a network"):
         open_twin(lab_scene, network="none", magnetometer="neural")
-    with pytest.raises(InputError, match=r"kind of MagnetometerSpec must be a known kind .*'physical'"):
+    with pytest.raises(InputError, match=r"kind of magnetometer must be a known kind .*'physical'"):
         open_twin(lab_scene, magnetometer="physicall")  # type: ignore[arg-type]
     run = simulate(open_twin(lab_scene, magnetometer="map-only"), duration_s=1.0)
     np.testing.assert_array_equal(run["b_total_nt"], run["b_map_nt"])

@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 import magpylib
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from pxr import Gf, Usd, UsdGeom
 from scipy.spatial.transform import Rotation
 from validators import assert_valid
@@ -16,7 +17,8 @@ from magtwin.field.sources.bodies import MU_0, Bodies
 from magtwin.field.sources.magnets import body_of
 from magtwin.path import Room, path_in
 from magtwin.path.points import path_of_points
-from magtwin.spec.lab import LabSpec, check_corners, on_polygon
+from magtwin.sim.motion.commands import Commands
+from magtwin.spec.lab import LabSpec, check_corners
 from magtwin.spec.walls import Door, Wall, Window
 from magtwin.twin import author_scene, open_twin, room_of, scan, scene_from_toml, simulate
 from magtwin.usd.lab.room import define_lab
@@ -79,7 +81,7 @@ def l_room(tmp_path_factory):
 
 
 def lab_room(lab: LabSpec, radius: float = 0.171) -> Room:
-    return Room(lab.floor_m, radius, obstacles_in(lab, ()), lab.border)
+    return Room(lab, radius, obstacles_in(lab, ()))
 
 
 def test_a_stage_of_walls_reads_back_as_its_toml_and_is_valid(l_room, tmp_path):
@@ -105,16 +107,38 @@ def test_every_key_of_walls_doors_and_windows_goes_into_the_stage_and_back(tmp_p
     assert open_scene(author_scene(scene, tmp_path / "l")).scene.lab == lab
 
 
+def test_a_random_driver_a_lidar_and_a_bump_know_a_floor_with_corners(l_room):
+    twin = open_twin(l_room[1])
+    lab, radius = twin.scene.lab, twin.scene.robot.footprint_radius_m
+    run = simulate(twin, "random", seed=3, duration_s=240.0, rate_hz=10)
+    p = run["p_world_base"][:, :2]
+    assert lab.inside_m(p).min() > radius
+    assert not run["flag_bump"].any()
+    assert np.ptp(p, axis=0).min() > 1.5  # it drives about
+    seen = np.concatenate(scan(twin, run).points_world())[:, :2]
+    assert np.abs(lab.inside_m(seen)).min() < 0.05  # sides of the room
+    assert lab.inside_m(seen).min() > -0.05  # and nothing behind them
+    bare = replace(twin.scene, lab=LabSpec(floor=lab.floor, wall_height_m=0.0))
+    pushed = simulate(bare, path_of_points([(3.5, 4.0), (3.8, 4.0)]), seed=1, rate_hz=10)
+    assert not pushed["flag_bump"].any()
+    over = Commands("push", np.array([[t, 0.2, 0.0] for t in np.arange(0.0, 4.0, 0.1)]))
+    pushed = simulate(replace(bare, start=(3.5, 4.0, 0.0)), over, seed=1, duration_s=4, rate_hz=10)
+    assert_array_equal(pushed["flag_bump"], lab.inside_m(pushed["p_world_base"][:, :2]) < radius - 1e-9)
+    assert pushed["flag_bump"].any()
+    with pytest.raises(InputError, match=r"leaves the floor .* inside of its 6 corners"):
+        simulate(bare, [(3.0, 4.5), (8.5, 2.0)])  # cuts the corner that points inwards
+
+
 def test_the_field_of_walls_and_doors_is_magpylibs(l_room):
     lab, rng = l_room[0].lab, np.random.default_rng(1)
-    tall, leaf = replace(lab.walls[0], magnetization=20.0), replace(lab.doors[0], magnetization=100.0)
+    tall, leaf = replace(lab.walls[0], magnetization=50.0), replace(lab.doors[0], magnetization=3000.0)
     lab = replace(lab, walls=(tall, lab.walls[1]), doors=(replace(leaf, open_deg=63.0), lab.doors[1]))
     steel = lab.magnets
     assert len(steel) == 4  # two solids and a lintel of the wall, and the leaf
     beside = [
         tall.at(s, d)
         for s, d in zip(
-            rng.uniform(-0.5, 3.5, 100), rng.choice([-1, 1], 100) * rng.uniform(0.06, 0.5, 100), strict=True
+            rng.uniform(-0.5, 3.5, 100), rng.choice([-1, 1], 100) * rng.uniform(0.06, 4.0, 100), strict=True
         )
     ]
     p = np.column_stack([beside, rng.uniform(0.0, 2.8, 100)])
@@ -128,8 +152,8 @@ def test_the_field_of_walls_and_doors_is_magpylibs(l_room):
         for source in steel
     )
     got = Bodies([body_of(source) for source in steel]).field_nt(p)
-    assert np.abs(got - want * 1e9).max() < 0.01  # dipoles replace far bodies, within 1e-5 of these fields
-    assert np.linalg.norm(got, axis=1).max() > 1000
+    assert np.abs(got - want * 1e9).max() < 0.01  # dipoles replace far bodies, within 1e-6 of these fields
+    assert np.linalg.norm(got, axis=1).max() > 10_000
 
 
 @pytest.mark.parametrize("open_deg", [0.0, 90.0, -90.0, 180.0, 40.0])
@@ -188,8 +212,8 @@ def test_coverage_enters_every_room_of_an_l_through_open_doors(l_room):
     rng, corners = np.random.default_rng(2), np.array(twin.scene.lab.corners)
     p = rng.uniform(corners.min(0), corners.max(0), (4000, 2))
     keep = twin.scene.robot.footprint_radius_m + 0.09  # its raster keeps some 0.085 m more from walls
-    clear, _ = room.standing.clearance(p)
-    free = p[on_polygon(p, room.corners) & (clear > keep)]
+    clear, _ = room.obstacles.clearance(p)
+    free = p[np.minimum(room.lab.inside_m(p), clear) > keep]
     away = np.abs(path.nearest(free)[1])
     share = float((away <= 0.25).mean())
     assert share >= 0.9
@@ -292,7 +316,18 @@ DOOR = '[[door]]\nwall = "a"\nat_m = 2\n'
         ),
         ("floor = [[0, 0], [4, 0], [4, 4]]\nfloor_m = [4, 4]", "", "floor", "floor_m .* left out"),
         ("floor = [[0, 0], [9000, 0], [9000, 5000]]", "", "floor", "metres"),
-        ("", "[[wall]]\nfrom = [1, 1]\nto = [1, 1]\n", "from", "end of WallTable must differ"),
+        (
+            "",
+            "[[wall]]\nfrom = [1, 1]\nto = [1, 1]\n",
+            "from",
+            "end of wall must differ from its start, `from`",
+        ),
+        (
+            "",
+            WALL + SHELF.replace("shelf", "desk").format(2, 1),
+            "p_world",
+            r"'desk' stands 0.10 m deep in wall 'a' at \(2.00, 1.00\); move it",
+        ),
         ("", WALL + "material = 'steal'\n", "material", "'steal'.*steel"),
         ("", WALL + "magnetization = 3.0\n", "magnetization", "plasterboard is not magnetic"),
         ("", WALL + WALL, "name", "'a' has a name that is taken"),
@@ -326,7 +361,12 @@ DOOR = '[[door]]\nwall = "a"\nat_m = 2\n'
             "from",
             "off the floor",
         ),
-        (f"floor = {CORNERS}", SHELF.format(7, 4), "p_world", "reaches 1.50 m off the floor, whose corners"),
+        (
+            f"floor = {CORNERS}",
+            SHELF.format(7, 4),
+            "p_world",
+            "reaches 1.25 m beyond the slab, which is the floor",
+        ),
         (f"floor = {CORNERS}", SHELF.format(9, 1.5), "p_world", "0.05 m deep in wall 'edge_1'"),
     ],
 )

@@ -15,6 +15,7 @@ from magtwin.frames import quat_from_yaw
 from magtwin.path.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, occupancy_of
 from magtwin.path.room import Room
 from magtwin.sim.sensors.lidar import ray_angles, scan
+from magtwin.spec.lab import LabSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.twin import open_twin, room_of
 
@@ -37,7 +38,7 @@ def triangle(x: float, y: float, turn: float, size: float) -> np.ndarray:
 )  # fmt: skip
 def test_outlines_are_occupied_and_nothing_that_is_farther_than_a_cell(x, y, turn, size, resolution) -> None:
     obstacles = Obstacles(("thing",), (triangle(x, y, turn, size),))
-    grid = occupancy_of(Room((6.0, 3.5), 0.17, obstacles), resolution_m=resolution)
+    grid = occupancy_of(Room(LabSpec(floor_m=(6.0, 3.5)), 0.17, obstacles), resolution_m=resolution)
     corners = obstacles.outlines[0]
     assert (at(grid, corners + 1e-6 * (corners.mean(0) - corners)) == OCCUPIED).all()
     assert at(grid, corners.mean(0)[None])[0] == OCCUPIED or size < resolution
@@ -82,7 +83,7 @@ def test_map_server_reads_the_files(tmp_path: Path) -> None:
 
 
 def test_wrong_resolutions_and_suffixes_are_refused(tmp_path: Path) -> None:
-    room = Room((6.0, 3.5), 0.17, Obstacles())
+    room = Room(LabSpec(floor_m=(6.0, 3.5)), 0.17, Obstacles())
     for resolution, match in ((0.0, "above 0"), (np.nan, "above 0"), (1e-4, "too many")):
         with pytest.raises(InputError, match=match):
             occupancy_of(room, resolution_m=resolution)

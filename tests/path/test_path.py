@@ -24,6 +24,7 @@ from magtwin.path import (
     sine,
     split_lawnmower,
 )
+from magtwin.spec.lab import LabSpec
 from magtwin.spec.obstacles import Obstacles
 
 FLOOR, FOOTPRINT = (6.0, 3.5), 0.171
@@ -131,14 +132,14 @@ RELEASED = {"figure8_path": True, "continous_cycle": True, "sinwave_data": False
 @pytest.mark.parametrize(("file", "closed"), RELEASED.items())
 def test_released_paths_are_read_and_lie_on_the_floor(real_data, file, closed):
     path = read_path_csv(real_data / f"aprilab/paths/{file}.csv")
-    check_on_floor(path, FLOOR, FOOTPRINT)
+    check_on_floor(path, LabSpec(floor_m=FLOOR), FOOTPRINT)
     assert path.closed == closed
 
 
 def test_a_path_that_leaves_the_floor_says_by_how_much():
     path = Path("far", np.array([[0.0, 0.0], [2.0, 0.0], [3.0, 0.0]]))
     with pytest.raises(InputError, match=r"at point 3 of 3, \(3\.000, 0\.000\) m, by 0\.171 m"):
-        check_on_floor(path, FLOOR, FOOTPRINT)
+        check_on_floor(path, LabSpec(floor_m=FLOOR), FOOTPRINT)
 
 
 @pytest.mark.parametrize(

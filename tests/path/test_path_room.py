@@ -11,6 +11,7 @@ from magtwin.cli import main
 from magtwin.errors import InputError
 from magtwin.path import CASES, PATHS, Path, check_clear, check_on_floor, path_named
 from magtwin.path.room import FLOOR_M, RADIUS_M, Room, fit_path, path_in
+from magtwin.spec.lab import LabSpec
 from magtwin.spec.obstacles import Obstacles
 
 
@@ -19,7 +20,9 @@ def box(x: float, y: float, wide: float, deep: float) -> np.ndarray:
 
 
 def room(x: float, y: float, *boxes: np.ndarray, radius: float = RADIUS_M) -> Room:
-    return Room((x, y), radius, Obstacles(tuple(f"box_{k}" for k in range(len(boxes))), boxes))
+    return Room(
+        LabSpec(floor_m=(x, y)), radius, Obstacles(tuple(f"box_{k}" for k in range(len(boxes))), boxes)
+    )
 
 
 @pytest.mark.parametrize("name", [*PATHS, *CASES])
@@ -38,7 +41,7 @@ def test_on_the_default_floor_named_paths_are_as_they_were_to_the_bit(name):
 )
 def test_a_named_path_fills_any_empty_floor_in_the_same_proportion(name, x, y, radius):
     path, made = path_in(room(x, y, radius=radius), name), path_named(name)
-    check_on_floor(path, (x, y), radius)
+    check_on_floor(path, LabSpec(floor_m=(x, y)), radius)
     reach, made_for = np.array([x, y]) / 2 - radius, np.array(FLOOR_M) / 2 - RADIUS_M
     np.testing.assert_allclose(
         np.abs(path.p_xy).max(axis=0) / reach, np.abs(made.p_xy).max(axis=0) / made_for, rtol=1e-9
@@ -57,9 +60,10 @@ def test_a_named_path_fills_any_empty_floor_in_the_same_proportion(name, x, y, r
 )
 def test_a_named_path_passes_what_stands_in_its_way(name, where):
     path = path_in(where, name)
-    check_on_floor(path, where.floor_m, where.footprint_radius_m)
+    check_on_floor(path, where.lab, where.footprint_radius_m)
     check_clear(path, where.obstacles, where.footprint_radius_m)
-    assert np.ptp(path.p_xy, axis=0).min() > 0.15 * min(where.floor_m)
+    assert np.ptp(path.p_xy, axis=0).min() > 0.15 * min(where.lab.floor_m)
+    assert name != "coverage" or path.swept >= 0.9
     assert name == "coverage" or len(path.p_xy) == len(path_named(name).p_xy)
 
 
@@ -70,7 +74,7 @@ def test_a_fit_keeps_the_shape_and_only_moves_what_is_small_enough():
     np.testing.assert_allclose(np.diff(moved.p_xy, axis=0), np.diff(square.p_xy, axis=0), atol=1e-12)
     shrunk = fit_path(square, room(2.0, 2.0))
     assert shrunk.placing[0] == shrunk.placing[1] < 1
-    check_on_floor(shrunk, (2.0, 2.0), RADIUS_M)
+    check_on_floor(shrunk, LabSpec(floor_m=(2.0, 2.0)), RADIUS_M)
 
 
 @pytest.mark.parametrize(
@@ -84,8 +88,8 @@ def test_a_fit_keeps_the_shape_and_only_moves_what_is_small_enough():
 def test_a_path_that_does_not_fit_is_told_what_would(points, said):
     path = Path("own", np.array(points, float))
     with pytest.raises(InputError, match=said):
-        check_on_floor(path, (4.0, 3.0), RADIUS_M)
-    check_on_floor(fit_path(path, room(4.0, 3.0)), (4.0, 3.0), RADIUS_M)
+        check_on_floor(path, LabSpec(floor_m=(4.0, 3.0)), RADIUS_M)
+    check_on_floor(fit_path(path, room(4.0, 3.0)), LabSpec(floor_m=(4.0, 3.0)), RADIUS_M)
 
 
 def test_no_room_is_refused():

@@ -82,7 +82,7 @@ def test_every_spec_is_checked_here():
 def test_no_number_of_a_spec_may_be_infinite_or_none(given, name, bad):
     value = getattr(given, name)
     wrong = (*value[:-1], bad) if isinstance(value, tuple) else bad
-    said = rf"^{name} of {type(given).__name__} must be finite, got .*{bad}"
+    said = rf"^{name} of [a-z ]+ must be finite, got .*{bad}"
     with pytest.raises(InputError, match=said):
         replace(given, **{name: wrong})
 
@@ -92,9 +92,9 @@ def test_no_number_of_a_spec_may_be_infinite_or_none(given, name, bad):
     [
         (ImuSpec(), {"q_link_sensor_xyzw": (0.0, 0.0, 0.0, 0.0)}, "unit quaternion"),
         (LidarSpec(), {"q_link_sensor_xyzw": (0.0, 0.0, 1.0, 2e-3)}, "unit quaternion"),
-        (ROBOT, {"q_base_imu_link_xyzw": (0.0, 0.0, 0.0, 2.0)}, "of RobotSpec .* unit quaternion"),
-        (EARTH, {"latitude_deg": -90.1}, r"latitude_deg of EarthFieldSpec .* -90\.1"),
-        (EARTH, {"longitude_deg": 361.0}, r"longitude_deg of EarthFieldSpec .* 361"),
+        (ROBOT, {"q_base_imu_link_xyzw": (0.0, 0.0, 0.0, 2.0)}, "of robot .* unit quaternion"),
+        (EARTH, {"latitude_deg": -90.1}, r"latitude_deg of earth field .* -90\.1"),
+        (EARTH, {"longitude_deg": 361.0}, r"longitude_deg of earth field .* 361"),
         (EARTH, {"date": "2026-02-30"}, "date .* YYYY-MM-DD, got '2026-02-30'"),
         (EARTH, {"date": "20260101"}, "YYYY-MM-DD"),
         (LidarSpec(), {"range_min_m": 12.0}, "range_min_m .* below range_max_m 12"),
@@ -108,7 +108,7 @@ def test_no_number_of_a_spec_may_be_infinite_or_none(given, name, bad):
         (LidarSpec(), {"rays": 90.5}, "rays .* whole number"),
         (BatterySpec(), {"model": "magic"}, "model .* 'magic'"),
         (BatterySpec(), {"discharge": (0.0, 0.6, 0.5, 1.0)}, "discharge .* rise"),
-        (LabSpec(), {"floor_m": (6.0, 0.0)}, "floor_m of LabSpec"),
+        (LabSpec(), {"floor_m": (6.0, 0.0)}, "floor_m of lab"),
     ],
 )
 def test_what_makes_no_sense_is_refused(given, change, said):

@@ -15,10 +15,13 @@ from magtwin.author.plan.floor import as_bar, enclosed
 from magtwin.author.plan.geojson import read_geojson
 from magtwin.author.plan.grid import read_grid
 from magtwin.author.plan.svg import read_svg
+from magtwin.author.rooms import EARTH
+from magtwin.author.tables import tables_of_lab, toml_text
 from magtwin.errors import InputError
 from magtwin.files.file import existing
+from magtwin.spec.base import Vec2
 from magtwin.spec.lab import LabSpec, off_floor_m
-from magtwin.spec.walls import Door, Structure, Wall, Window, corners_of
+from magtwin.spec.walls import Door, Wall, Window, corners_of
 
 READERS: Mapping[str, Callable[[Path], Drawing]] = MappingProxyType(
     {".svg": read_svg, ".dxf": read_dxf, ".geojson": read_geojson, ".json": read_geojson}
@@ -30,6 +33,9 @@ WORDS = (
     ("", r"text|dim|anno|hatch|furn|m(?:oe|ö)bel|grid|axis|axes|title|stair|symbol|defpoints|equip|plumb"),
 )
 """Words in the name of a layer that say what it is; of others, the lines are walls."""
+
+HIGH_M = 2.5
+"""Height of the sides of a floor whose border is drawn [m]."""
 
 THICK_M, STROKES_M = 0.1, (0.04, 0.6)
 """Thickness of a wall, unless its stroke has a width in a range [m]."""
@@ -49,9 +55,10 @@ MOST_WALLS = 3000
 
 @dataclass
 class Plan:
-    """What a scene's TOML says of a room."""
+    """What is read of a room."""
 
-    lab: dict[str, object] = field(default_factory=dict)
+    floor: tuple[Vec2, ...] = ()
+    sides: Mapping[str, float] = field(default_factory=dict)
     walls: list[Wall] = field(default_factory=list)
     openings: list[Door | Window] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -76,10 +83,13 @@ def plan_toml(path: Path, name: str, scale: float | None = None) -> tuple[str, l
     if scale is not None and not 0 < scale < math.inf:
         raise InputError(f"scale must be above 0 metres per unit, got {scale!r}", parameter="scale")
     if suffix in GRIDS:
-        plan = Plan()
-        corners, bars, plan.notes = read_grid(path, scale)
-        plan.lab = {"floor": corners, "wall_height_m": 2.5}
-        plan.walls = [_wall(k, p, thick) for k, (p, thick) in enumerate(bars)]
+        corners, bars, notes = read_grid(path, scale)
+        plan = Plan(
+            corners,
+            {"wall_height_m": HIGH_M},
+            [_wall(k, p, thick) for k, (p, thick) in enumerate(bars)],
+            notes=notes,
+        )
     else:
         plan = _plan(READERS[suffix](path), path, scale)
     if len(plan.walls) > MOST_WALLS:
@@ -87,19 +97,21 @@ def plan_toml(path: Path, name: str, scale: float | None = None) -> tuple[str, l
             f"{path}: {len(plan.walls):,} walls, at most {MOST_WALLS:,}; leave out what is no wall"
         )
     try:
-        lab = LabSpec(**plan.lab)  # type: ignore[arg-type]
+        lab = LabSpec(floor=plan.floor, **plan.sides)  # type: ignore[arg-type]
+        off = {wall.name for wall in plan.walls if off_floor_m(wall, lab)[1].min() > 0}
+        if off:
+            plan.notes.append(f"{len(off)} lines left out that stand off the floor")
+        openings = [each for each in plan.openings if each.wall not in off]
+        lab = replace(
+            lab,
+            walls=tuple(wall for wall in plan.walls if wall.name not in off),
+            doors=tuple(each for each in openings if isinstance(each, Door)),
+            windows=tuple(each for each in openings if isinstance(each, Window)),
+        )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    off = {wall.name for wall in plan.walls if off_floor_m(wall, lab)[1].min() > 0}
-    if off:
-        plan.notes.append(f"{len(off)} lines left out that stand off the floor")
-        plan.walls = [wall for wall in plan.walls if wall.name not in off]
-        plan.openings = [each for each in plan.openings if each.wall not in off]
-    doors = [each for each in plan.openings if isinstance(each, Door)]
-    windows = [each for each in plan.openings if isinstance(each, Window)]
-    for _, _, _, text in Structure.named(plan.walls, doors, windows, lab.sides).faults():
-        raise InputError(f"{path}: {text}")
-    return _text(plan, name, path), plan.notes
+    head = HEAD.format(name=name, file=path.name, notes="".join(f"# {note}\n" for note in plan.notes))
+    return head + toml_text({"name": name, **REST, **tables_of_lab(lab)}), plan.notes
 
 
 def _plan(drawing: Drawing, path: Path, scale: float | None) -> Plan:
@@ -143,10 +155,11 @@ def _plan(drawing: Drawing, path: Path, scale: float | None) -> Plan:
     for kind in ("door", "window"):
         _open(plan, kinds[kind], kind, sides)
     if floor is not None:
-        plan.lab = {"floor": _corners(floor.p), "wall_height_m": 2.5, "wall_thickness_m": THICK_M}
+        plan.floor = _corners(floor.p)
+        plan.sides = {"wall_height_m": HIGH_M, "wall_thickness_m": THICK_M}
     else:
-        border = np.round(enclosed([np.array(corners_of(wall)) for wall in plan.walls]), 3)
-        plan.lab = {"floor": _corners(border), "wall_height_m": 0.0}
+        plan.sides = {"wall_height_m": 0.0}
+        plan.floor = _corners(np.round(enclosed([np.array(corners_of(wall)) for wall in plan.walls]), 3))
     return plan
 
 
@@ -155,7 +168,7 @@ def _kind(line: Line) -> str:
     return next((kind for kind, words in WORDS if re.search(words, line.layer.lower())), "wall")
 
 
-def _corners(p: Array) -> tuple[tuple[float, float], ...]:
+def _corners(p: Array) -> tuple[Vec2, ...]:
     """Corners (N, 2) without equal neighbours, and without those on a straight line."""
     p = p[np.hypot(*(p - np.roll(p, 1, axis=0)).T) > 2e-3]
     before, after = p - np.roll(p, 1, axis=0), np.roll(p, -1, axis=0) - p
@@ -248,35 +261,9 @@ def _place(span: Array, walls: tuple[Wall, ...]) -> tuple[Wall | None, Array] | 
 HEAD = """\
 # {name}: made from {file} by `magtwin new --plan`.
 # `magtwin scene FILE.toml --out DIR` makes its USD stage, `magtwin run DIR/{name}.usda` drives the robot
-# through it. Lengths are in metres. docs/scenes.md of magtwin has every key.
+# through it, in strips over the whole floor and through every open door. Lengths are in metres.
+# [earth] is where the room is, and when. docs/scenes.md of magtwin has every key.
 {notes}
-name = "{name}"
-
-[robot]
-asset = "turtlebot4"
-path = "coverage"              # strips over the whole floor, through every open door
-
-[earth]                        # where the room is, and when
-latitude_deg = 29.65
-longitude_deg = -82.35
-height_m = 50.0
-date = "2026-11-21"
-
 """
-
-
-def _text(plan: Plan, name: str, path: Path) -> str:
-    """The TOML of a plan."""
-    notes = "".join(f"# {note}\n" for note in plan.notes)
-    parts = [HEAD.format(name=name, file=path.name, notes=notes), "[lab]\nfloor = [\n"]
-    corners: tuple[tuple[float, float], ...] = plan.lab["floor"]  # type: ignore[assignment]
-    parts += [f"  [{x:g}, {y:g}],\n" for x, y in np.round(corners, 3).tolist()]
-    parts += ["]\n", *(f"{key} = {value}\n" for key, value in plan.lab.items() if key != "floor")]
-    for wall in plan.walls:
-        ends = "from = [{:g}, {:g}]\nto = [{:g}, {:g}]".format(*wall.start, *wall.end)
-        parts.append(f'\n[[wall]]\nname = "{wall.name}"\n{ends}\nthickness_m = {wall.thickness_m:g}\n')
-    for each in plan.openings:
-        table = "door" if isinstance(each, Door) else "window"
-        place = f'wall = "{each.wall}"\nat_m = {each.at_m:g}\nwidth_m = {each.width_m:g}\n'
-        parts.append(f'\n[[{table}]]\nname = "{each.name}"\n{place}')
-    return "".join(parts)
+REST = MappingProxyType({"robot": {"asset": "turtlebot4", "path": "coverage"}, "earth": EARTH})
+"""What a plan does not tell."""

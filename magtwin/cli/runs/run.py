@@ -204,7 +204,7 @@ def _check(
 ) -> None:
     """Refuse options that are for another way of driving, and those that would be refused late."""
     from magtwin.run.run import Run
-    from magtwin.sim.motion.drive_input import drive_input
+    from magtwin.sim.motion.drive_input import check_path
     from magtwin.sim.runs.simulate import check_asked
 
     if live and settings.viewer:
@@ -226,7 +226,7 @@ def _check(
             raise InputError(f"{option} {fault}, and {path} is none; drop one")
     check_asked(options["duration_s"], settings.rate_hz, options["speed"])
     if isinstance(what, str):
-        drive_input(what)  # refuses a wrong name
+        check_path(what)
     if newton:
         from magtwin.sim.engines.newton import check_installed
 

@@ -84,7 +84,7 @@ def sweep(
     from magtwin.files.kinds import scene_file
     from magtwin.io.outputs import driven_by
     from magtwin.parallel import parse_shard
-    from magtwin.sim.motion.drive_input import drive_input
+    from magtwin.sim.motion.drive_input import check_path, drive_input
     from magtwin.sim.runs.simulate import check_asked
     from magtwin.twin import MIXTURE, open_twin, room_of
     from magtwin.twin import sweep as drive_many
@@ -103,7 +103,7 @@ def sweep(
     check_asked(duration_s, rate_hz, 0.2 if speed is None else speed)
     paths = [driven_by(name) for name in path or MIXTURE]
     for what in paths:
-        drive_input(what)  # refuses a wrong name before the scene is opened
+        check_path(what)
     part = None if shard is None else parse_shard(shard)
     out = out if part else named(out, force=force)  # shards share one folder
     step("Opening the scene")

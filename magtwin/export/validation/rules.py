@@ -17,7 +17,6 @@ from magtwin.export.contents import named_files, weights_metadata
 from magtwin.export.validation.findings import Severity
 from magtwin.export.validation.rule import Subject, Wrong, rule, wrong_of
 from magtwin.files.file import sha256
-from magtwin.spec.lab import on_polygon
 from magtwin.usd.lab.looks import VISUALS
 from magtwin.usd.lab.obstacles import read_obstacles
 from magtwin.usd.lab.room import read_lab
@@ -176,12 +175,11 @@ def network_inputs(subject: Subject) -> Iterator[Wrong]:
 def map_inside(subject: Subject) -> Iterator[Wrong]:
     """Every map lies within the floor of its lab."""
     for stage in subject.labs:
-        half = np.array(read_lab(prims_with(stage.GetPseudoRoot(), "lab")[0]).floor_m) / 2
+        lab = read_lab(prims_with(stage.GetPseudoRoot(), "lab")[0])
         for prim in prims_with(stage.GetPseudoRoot(), "anomalyMap"):
-            x0, x1, y0, y1 = (field := read_map(prim)).extent
-            beyond = max(float(np.max(np.abs([[x0, y0], [x1, y1]]) - half)), 0.0)
-            if beyond > max(field.cell_m) / 2 + SAME_M:
-                text = f"reaches {beyond:.3g} m beyond the floor of {2 * half[0]:g} x {2 * half[1]:g} m"
+            over = np.subtract((field := read_map(prim)).extent, lab.extent_m) * (-1, 1, -1, 1)
+            if over.max() > max(field.cell_m) / 2 + SAME_M:
+                text = f"reaches {over.max():.3g} m beyond the floor of {lab.size_text}"
                 yield Wrong(text, str(prim.GetPath()))
 
 
@@ -191,12 +189,10 @@ def robot_inside(subject: Subject) -> Iterator[Wrong]:
     for stage in subject.labs:
         world, cache = stage.GetPseudoRoot(), UsdGeom.XformCache()
         lab = read_lab(prims_with(world, "lab")[0])
-        half = np.array(lab.floor_m) / 2
         for prim in prims_with(world, "robot"):
             x, y, _ = cache.GetLocalToWorldTransform(prim).ExtractTranslation()
             radius = read_footprint(prim)
-            off = lab.floor and not on_polygon(np.array([[x, y]]), lab.floor)[0]
-            if off or np.any(np.abs([x, y]) + radius > half + SAME_M):
+            if lab.inside_m([[x, y]])[0] < radius - SAME_M:
                 text = f"stands at ({x:g}, {y:g}) m and needs {radius:g} m about it: it is off the floor"
                 yield Wrong(text, str(prim.GetPath()))
 

@@ -23,11 +23,14 @@ MU_0 = 4 * math.pi * MU_0_OVER_4_PI  # Magnetic constant [T m/A]
 # Target error of the dipoles that replace a box or a cylinder, relative to its largest field at that distance
 # from its box. One in a hundred random bodies exceeds it, none reaches twice as much.
 TOLERANCE = 1e-4
+# That of walls and doors of solid steel, boxes at least so thick [m], and this many times as wide as thick:
+# strong, and passed at arm's length. They stay within 0.01 nT.
+PLATE_TOLERANCE, PLATE_M, PLATE_WIDE = 1e-6, 0.01, 4.0
 # Distance up to which a mesh's field is exact, in its longest side; beyond, four dipoles replace it, within
 # 0.2 % for nearly convex meshes
 MESH_SIZES = 3.0
 # Most dipoles that replace a box or a cylinder; nearer than they suffice, its field is exact
-MOST_DIPOLES = 512
+MOST_DIPOLES, MOST_OF_A_PLATE = 512, 128
 # Ratio of the distances at which a body gets a new set of dipoles, and their number: up to 45,000 times as
 # far
 LADDER, RUNGS = 1.25, 48
@@ -58,6 +61,17 @@ class Body:
             return mesh_moments(self.vertices, self.faces)[0]
         share = {"cuboid": 1, "cylinder": np.pi / 4, "sphere": np.pi / 6}[self.shape]
         return float(np.prod(self.size_m)) * share
+
+    @property
+    def is_plate(self) -> bool:
+        """Whether it is a box like a wall or a door of solid steel."""
+        thin, wide, _ = np.sort(self.size_m)
+        return self.shape == "cuboid" and bool(thin >= PLATE_M and wide >= PLATE_WIDE * thin)
+
+    @property
+    def tolerance(self) -> float:
+        """Target error of the dipoles that replace it, see `TOLERANCE`."""
+        return PLATE_TOLERANCE if self.is_plate else TOLERANCE
 
     @cached_property
     def rotation(self) -> Array:
@@ -173,17 +187,17 @@ def _gauss(count: int) -> tuple[Array, Array, Array]:
     return nodes, weights / 2, weights * np.polynomial.legendre.legval(nodes, rises)
 
 
-def _count(half: float, distance: float) -> int:
+def _count(half: float, distance: float, tolerance: float) -> int:
     """Nodes that a rule over -half..half needs for a field point at distance `distance` aside.
 
     One is enough if the neglected second moment is small. The error of n nodes falls as rho^-2n, with rho = d
     / a + sqrt(1 + (d / a)^2) the Bernstein ellipse through the nearest singularity (Trefethen 2013,
     Approximation Theory and Practice, theorem 19.3), and grows as n^3/2, since a dipole's field is steep.
     """
-    if SECOND * (half / distance) ** 2 <= TOLERANCE:
+    if SECOND * (half / distance) ** 2 <= tolerance:
         return 1
     count, rate = 2, 2 * math.asinh(distance / half)
-    while AMPLIFIED * (2 * count) ** 1.5 * math.exp(-rate * count) > TOLERANCE:
+    while AMPLIFIED * (2 * count) ** 1.5 * math.exp(-rate * count) > tolerance:
         count += 1
     return count
 
@@ -193,9 +207,9 @@ def _count(half: float, distance: float) -> int:
 SECOND, AMPLIFIED, FOURTH = 4.0, 60.0, 80.0
 
 
-def _line(half: float, thin: float, distance: float) -> tuple[Array, Array]:
+def _line(half: float, thin: float, distance: float, tolerance: float) -> tuple[Array, Array]:
     """Nodes and weights for the mean of f - thin^2 / 6 f'' over -half..half."""
-    count = _count(math.sqrt(max(half**2 - thin**2, 0.0)), distance)
+    count = _count(math.sqrt(max(half**2 - thin**2, 0.0)), distance, tolerance)
     nodes, weights, slopes = _gauss(count)
     if count == 2:
         return math.sqrt((half**2 - thin**2) / 3) * np.array([-1.0, 1.0]), weights
@@ -209,18 +223,18 @@ def _dipoles_of(body: Body, distance: float) -> tuple[Array, Array]:
     those along the others. These take over its mean, c^2 / 6 times it, and one node is enough across. A cube
     is one dipole, a rod a row, a plate a sheet, all correct to fourth order in c.
     """
-    half = body.size_m / 2
+    half, tolerance = body.size_m / 2, body.tolerance
     if body.shape == "sphere":  # exactly a dipole
         return np.zeros((1, 3)), np.ones(1)
     if body.shape == "cylinder":
-        return _of_a_cylinder(half[0], half[2], distance)
+        return _of_a_cylinder(half[0], half[2], distance, tolerance)
     if body.vertices is not None and body.faces is not None:  # two on each of the two longer principal axes
         _, centroid, second = mesh_moments(body.vertices, body.faces)
         spread, axes = np.linalg.eigh(second)
         arms = [math.sqrt(2 * max(spread[k] - spread[0], 0.0)) * axes[:, k] for k in (1, 2)]
         return centroid + np.array([sign * arm for arm in arms for sign in (-1, 1)]), np.full(4, 0.25)
-    thin = float(half.min()) if _is_thin(half.min(), distance) else 0.0
-    rules = [_line(h, thin, distance) for h in half]
+    thin = float(half.min()) if _is_thin(half.min(), distance, tolerance) else 0.0
+    rules = [_line(h, thin, distance, tolerance) for h in half]
     nodes = np.stack(np.meshgrid(*[x for x, _ in rules], indexing="ij"), -1)
     shares = np.einsum("i,j,k->ijk", *[w for _, w in rules])
     return nodes.reshape(-1, 3), shares.ravel()
@@ -228,29 +242,31 @@ def _dipoles_of(body: Body, distance: float) -> tuple[Array, Array]:
 
 def _how_many(body: Body, distance: float) -> int:
     """Number of dipoles from `_dipoles_of` for a box or a cylinder, or slightly more."""
-    sides = body.size_m / 2
-    counts = [_count(half, distance) for half in sides]
+    sides, tolerance = body.size_m / 2, body.tolerance
+    counts = [_count(half, distance, tolerance) for half in sides]
     if body.shape == "cylinder":
-        rings = 1 if _is_thin(sides[0], distance) else counts[0]
+        rings = 1 if _is_thin(sides[0], distance, tolerance) else counts[0]
         return counts[2] * (1 if rings == 1 else rings * (2 * rings + 2))
-    if _is_thin(sides.min(), distance):
+    if _is_thin(sides.min(), distance, tolerance):
         counts[int(sides.argmin())] = 1
     return math.prod(counts)
 
 
-def _is_thin(half: float, distance: float) -> bool:
+def _is_thin(half: float, distance: float, tolerance: float) -> bool:
     """Whether one node is enough across a side, with its second moment moved to the others."""
-    return FOURTH * (half / distance) ** 4 <= TOLERANCE
+    return FOURTH * (half / distance) ** 4 <= tolerance
 
 
-def _of_a_cylinder(radius: float, half: float, distance: float) -> tuple[Array, Array]:
+def _of_a_cylinder(radius: float, half: float, distance: float, tolerance: float) -> tuple[Array, Array]:
     """A rule along the axis, times one in the squared radius with evenly spaced angles."""
     disc, part = np.zeros((1, 2)), np.ones(1)
-    if _is_thin(radius, distance) and half > radius:  # second moments are half^2 / 3 and radius^2 / 4
-        along, share = _line(half, math.sqrt(0.75) * radius, distance)
+    if (
+        _is_thin(radius, distance, tolerance) and half > radius
+    ):  # second moments are half^2 / 3 and radius^2 / 4
+        along, share = _line(half, math.sqrt(0.75) * radius, distance, tolerance)
     else:
-        along, share = _line(half, 0.0, distance)
-        if (rings := _count(radius, distance)) > 1:
+        along, share = _line(half, 0.0, distance, tolerance)
+        if (rings := _count(radius, distance, tolerance)) > 1:
             square, weight, _ = _gauss(rings)
             spokes = 2 * rings + 2
             angle = 2 * np.pi * np.arange(spokes) / spokes
@@ -273,7 +289,8 @@ class _Cut:
             self.near = MESH_SIZES * float(body.size_m.max())
         elif body.shape != "sphere":
             distance = float(body.size_m.max()) * LADDER**16
-            while _how_many(body, distance) <= MOST_DIPOLES:
+            most = MOST_OF_A_PLATE if body.is_plate else MOST_DIPOLES
+            while _how_many(body, distance) <= most:
                 self.near, distance = distance, distance / LADDER
 
     def dipoles(self, rung: int) -> tuple[Array, Array]:

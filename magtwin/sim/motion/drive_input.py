@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
-from magtwin.path import Path, resolve_path
+from magtwin.path import CASES, PATHS, Path, resolve_path
 from magtwin.path.room import SWEPT, Room, fit_path, path_in
 from magtwin.run.run import Run
 from magtwin.sim.motion.commands import Commands
@@ -37,6 +37,12 @@ def drive_input(path: Any, room: Room | None = None, *, fit: bool = False) -> Dr
         f"{type(path).__name__}",
         parameter="path",
     )
+
+
+def check_path(path: Any) -> None:
+    """Refuse what `drive_input` would, before a scene is opened. A named path is not planned for it."""
+    if not (isinstance(path, str) and path in (*PATHS, *CASES)):
+        drive_input(path)
 
 
 def each_input(paths: Any) -> list[Any]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.sim.motion.drive import Pose
 from magtwin.spec.drive import DriveSpec
+from magtwin.spec.lab import LabSpec
 from magtwin.spec.obstacles import Obstacles
 
 Array = NDArray[np.float64]
@@ -61,7 +62,7 @@ class Driver:
         drive: DriveSpec,
         rng: np.random.Generator,
         *,
-        floor_m: tuple[float, float],
+        lab: LabSpec,
         obstacles: Obstacles,
         footprint_radius_m: float,
         start: Pose,
@@ -75,14 +76,15 @@ class Driver:
             )
         self._drive, self._rng, self._speed, self._duration_s = drive, rng, speed, duration_s
         self._keep = footprint_radius_m + MARGIN_M
-        self._half = floor_m[0] / 2, floor_m[1] / 2
-        self._clear = _clearances(floor_m, obstacles)
+        x0, x1, y0, y1 = lab.extent_m
+        self._low = x0, y0
+        self._clear = _clearances(lab, obstacles)
         if self._clearance(start[0], start[1]) < self._keep:
             raise InputError(
                 f"a driver has no room at ({start[0]:.3f}, {start[1]:.3f}) m: less than {self._keep:.3f} m "
                 "from a wall or an obstacle; begin elsewhere"
             )
-        across = [np.arange(-half + PLACE_M / 2, half, PLACE_M) for half in self._half]
+        across = [np.arange(low + PLACE_M / 2, high, PLACE_M) for low, high in ((x0, x1), (y0, y1))]
         grid = np.array([(x, y) for x in across[0] for y in across[1]])
         free = [self._clearance(x, y) > self._keep + 0.05 for x, y in grid.tolist()]
         self._places = grid[free] if any(free) else np.array([start[:2]])
@@ -199,20 +201,19 @@ class Driver:
 
     def _clearance(self, x: float, y: float) -> float:
         """Lower bound of the distance of a point from everything [m]."""
-        half_x, half_y = self._half
-        i, j = round((x + half_x) / CELL_M), round((y + half_y) / CELL_M)
+        low_x, low_y = self._low
+        i, j = round((x - low_x) / CELL_M), round((y - low_y) / CELL_M)
         rows = self._clear
         return rows[i][j] if 0 <= i < len(rows) and 0 <= j < len(rows[0]) else 0.0
 
 
-def _clearances(floor_m: tuple[float, float], obstacles: Obstacles) -> list[list[float]]:
+def _clearances(lab: LabSpec, obstacles: Obstacles) -> list[list[float]]:
     """Distances of a grid's nodes from the floor's border and all obstacles, less half a cell [m]."""
-    half_x, half_y = floor_m[0] / 2, floor_m[1] / 2
-    x = -half_x + CELL_M * np.arange(round(floor_m[0] / CELL_M) + 1)
-    y = -half_y + CELL_M * np.arange(round(floor_m[1] / CELL_M) + 1)
-    border = np.minimum((half_x - np.abs(x))[:, None], (half_y - np.abs(y))[None, :])
+    x0, x1, y0, y1 = lab.extent_m
+    x = x0 + CELL_M * np.arange(round((x1 - x0) / CELL_M) + 1)
+    y = y0 + CELL_M * np.arange(round((y1 - y0) / CELL_M) + 1)
     p = np.column_stack([np.repeat(x, len(y)), np.tile(y, len(x))])
     distance, _ = obstacles.clearance(p, reach_m=1.0)
-    nearest = np.minimum(distance.reshape(len(x), len(y)), border) - CELL_M * math.sqrt(0.5)
-    rows: list[list[float]] = nearest.tolist()
+    nearest = np.minimum(distance, lab.inside_m(p)) - CELL_M * math.sqrt(0.5)
+    rows: list[list[float]] = nearest.reshape(len(x), len(y)).tolist()
     return rows

@@ -140,7 +140,7 @@ def _controller(trip: Trip, conditions: Conditions) -> Controller | None:
         return Driver(
             scene.robot.drive,
             trip.draws["driver"],
-            floor_m=scene.lab.floor_m,
+            lab=scene.lab,
             obstacles=conditions.obstacles,
             footprint_radius_m=scene.robot.footprint_radius_m,
             start=scene.start,

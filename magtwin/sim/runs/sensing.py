@@ -215,10 +215,8 @@ class Sensing:
                 columns["b_vector_measured_nt"] = self._magnetometer.axes(vector, steep=steep)
             else:
                 self._magnetometer.skip_axes(vector, steep=steep)
-        x, y = np.abs(now.pose[:, 0]), np.abs(now.pose[:, 1])
-        most_x, most_y = np.array(scene.lab.floor_m) / 2 + 1e-9
-        radius = robot.footprint_radius_m
-        columns["flag_bump"] = now.bump | (x + radius > most_x) | (y + radius > most_y)
+        off = scene.lab.inside_m(now.pose[:, :2]) + 1e-9 < robot.footprint_radius_m
+        columns["flag_bump"] = now.bump | off
         if self._neighbours:
             columns["flag_bump"] |= touching(t, motion, robot, self._neighbours)
         columns["flag_out_of_distribution"] = np.zeros(len(t), bool)

@@ -141,7 +141,7 @@ def check_run(scene: Scene, path: DriveInput, conditions: Conditions) -> None:
     _check_numbers(robot)
     lidar_on(robot.lidar, 0.0, conditions.lidar)  # refuses an unknown mode before anything is computed
     if isinstance(path, Path):
-        check_on_floor(path, scene.lab.floor_m, robot.footprint_radius_m, scene.lab.border)
+        check_on_floor(path, scene.lab, robot.footprint_radius_m)
     if conditions.duration_s is not None:
         _check_readings(conditions.duration_s, rate)
 

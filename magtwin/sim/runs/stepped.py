@@ -190,8 +190,7 @@ class SteppedRobots:
             rates = wheel_rates(self._record[which, 5], self._record[which, 6], drive)
             self._angle[which] += np.sum(rates, axis=1) / CONTROL_RATE_HZ
         now = self._moment(which, -1)
-        half = np.array(self.scene.lab.floor_m) / 2
-        beyond = np.any(np.abs(now.pose[:, :2]) + robot.footprint_radius_m > half + 1e-9, axis=1)
+        beyond = self.scene.lab.inside_m(now.pose[:, :2]) + 1e-9 < robot.footprint_radius_m
         spins = lidar_on(robot.lidar, self._t[which] + self._lidar_s[which], "schedule")
         table = truth(now, self._t[which], robot.base_height_m)
         table = {name: table[name] for name in table if name in SENSED}

@@ -23,6 +23,7 @@ from magtwin.sim.motion.driver import Driver
 from magtwin.sim.motion.engine import KINEMATIC, Kinematic
 from magtwin.sim.motion.follow import STAND, follow, loop_along, loop_by_commands, play
 from magtwin.spec.drive import DriveSpec
+from magtwin.spec.lab import LabSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.twin import open_twin, simulate
 from magtwin.twin.twin import without_tracking_error
@@ -159,7 +160,7 @@ def drive_about(seed, *, duration_s=300.0, obstacles, wheel_errors=(0.0, 0.0)):
     driver = Driver(
         DRIVE,
         np.random.default_rng(seed),
-        floor_m=(6.0, 3.5),
+        lab=LabSpec(floor_m=(6.0, 3.5)),
         obstacles=obstacles,
         footprint_radius_m=0.171,
         start=(0.0, 0.0, 0.0),
