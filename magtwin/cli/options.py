@@ -110,11 +110,12 @@ Session = Annotated[
     int | Literal["survey"] | None,
     Parameter(
         converter=_session,
-        help="Number of the session. It and the seed determine battery charge, IMU offsets, wheels, odometry "
-        "and the robot's own field. survey: the robot as it was when the map was surveyed. Default: 0.",
+        show_choices=False,
+        help="Number of the session, in which the seed draws battery charge, IMU offsets, wheels, odometry "
+        "and the robot's own field; or survey, the robot as it was when the map was surveyed. Default: 0.",
     ),
 ]
-Sessions = Annotated[int | Literal["survey"] | None, Parameter(converter=_session)]
+Sessions = Annotated[int | Literal["survey"] | None, Parameter(converter=_session, show_choices=False)]
 Plant = Annotated[
     str | None,
     Parameter(

@@ -39,7 +39,7 @@ def draw(
     *,
     show: Show | None = None,
     force: bool = False,
-    advance: Callable[[int, int], None] = lambda done, total: None,
+    advance: Callable[[int, int, str], None] = lambda done, total, what: None,
     **options: Any,
 ) -> tuple[Path, Sequence[str]]:
     """Draw a run, a stage, a map or a recording; or compare two runs or two maps in a picture.
@@ -50,7 +50,7 @@ def draw(
         show: What to draw of a run, or of a map, a stage's too. None: charts of a run unless `at_s` or
             `camera` asks for a picture; a recording as its viewer shows it; a map's overview; a stage.
         force: Whether an existing output is replaced.
-        advance: Called with the frames of a film that are drawn, and their number.
+        advance: Called with the frames of a film that are drawn, their number, and a hint.
         options: at_s [s], camera, size [pixels], scene, headings [rad], pace and fps, as far as what is drawn
             has them (`WAYS`).
 
@@ -66,7 +66,7 @@ def draw(
     suffix = out.suffix.lower()
     if not any(suffix in known for known in SUFFIXES.values()):
         raise InputError(f"{out}: a picture ends in .png, .svg or .jpg, and a film in .mp4 or .gif")
-    paths = [existing(shipped_or(file), "run, stage, map or recording") for file in files]
+    paths = [_layer_in(existing(shipped_or(file), "run, stage, map or recording")) for file in files]
     way = _way(paths, suffix, show, given)
     kind, what, takes = WAYS[way]
     if suffix not in SUFFIXES[kind]:
@@ -111,6 +111,15 @@ def _way(paths: Sequence[Path], suffix: str, show: Show | None, given: dict[str,
     return "moment" if looks else "charts"
 
 
+def _layer_in(path: Path) -> Path:
+    """The map layer of a folder that holds one and is of no other kind; any other path as it is."""
+    from magtwin.usd.maps.layer import is_map_layer
+
+    unknown = path.is_dir() and kind_of(path) is None
+    layers = [file for file in sorted(path.glob("*.usd[ac]")) if is_map_layer(file)] if unknown else []
+    return layers[0] if len(layers) == 1 else path
+
+
 def _is_survey(path: Path) -> bool:
     return path.is_dir() and kind_of(path) is SURVEY
 
@@ -130,7 +139,7 @@ def _draw(
     show: Show | None,
     *,
     force: bool = False,
-    advance: Callable[[int, int], None],
+    advance: Callable[[int, int, str], None],
     **given: Any,
 ) -> Sequence[str]:
     """Draw files in a way; messages of the Rerun viewer."""

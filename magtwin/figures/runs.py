@@ -191,10 +191,11 @@ def _residuals(run: Run) -> list[Panel]:
     if not (np.nan_to_num(told - field).any() and np.nan_to_num(error).any()):
         if exact is None:
             return [Panel("what the map\nlacks [nT]", tuple(lacks), 2.0, None, about_zero=True)]
-        lacks.append(("exact − map", exact - field, {"color": DATA}))  # nothing is predicted
+        lacks[0][2]["lw"] = 3.0  # nothing is predicted, and the next line covers it
+        lacks.append(("exact − map", exact - field, {"color": DATA}))
         error, sd, look, title = run[read] - exact, None, {"color": DATA}, "reading − exact"
     else:
-        lacks.append(("predicted", told - field, {"color": MODEL, "lw": 1.6}))
+        lacks.append(("predicted", told - field, {"color": MODEL, "lw": 1.0}))
         sd = Z_90 * run["b_sd_nt"] if _has(run, "b_sd_nt") else None
         look, title = {"color": MODEL}, f"prediction − {name}"
     title += f": mean size {np.nanmean(np.abs(error)):,.0f} nT" if np.isfinite(error).any() else ""

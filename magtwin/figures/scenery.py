@@ -69,8 +69,8 @@ TRAIL_SPAN_M = 6.0
 UNKNOWN = (150, 150, 150)
 """Colour of the trail where the field is unknown."""
 
-LABEL: Any = {"position": (0.02, 0.93), "viewport": True, "color": INK}
-"""Place and colour of the line of text at the upper left."""
+LABEL: Any = {"position": (0.02, 0.965), "viewport": True, "color": INK}
+"""Place of the top and colour of the line of text at the upper left."""
 
 SAMPLES = 4
 """Samples per pixel in frames of a film."""
@@ -191,6 +191,7 @@ class Scenery:
                 self.plotter.disable_anti_aliasing()
                 self.plotter.enable_anti_aliasing("msaa", multi_samples=SAMPLES)
             self._label = self.plotter.add_text(" ", font_size=max(8, round(size[1] / 60)), **LABEL)
+            self._label.prop.SetVerticalJustificationToTop()
             self._label.prop.background_color, self._label.prop.background_opacity = BACKGROUND, 0.7
             self._cutaway = Cutaway(self.plotter, size, self._screens, list(self._actors.values()))
         except BaseException:

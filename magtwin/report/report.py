@@ -8,8 +8,12 @@ from typing import Any
 
 from magtwin.report.summary import LINES, Summarized, Summary
 
-_NUMBERS = re.compile(r"-?\d+(\.\d+)?(, -?\d+(\.\d+)?)+")
-"""A text of several numbers, such as the place of a sensor."""
+_NUMBER = r"[+-]?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e[+-]?\d+)?"
+_NUMBERS = re.compile(rf"\(?(?:x )?{_NUMBER}(?:(?:, [xyz ]*| x | to | of |\.\.){_NUMBER})+\)?")
+"""A text of several numbers, such as the place of a sensor, a size or a range."""
+
+_UNITS = re.compile(r".*_(?:m|s|nt|hz|deg|rad|kg|v|a)")
+"""Names that end in a unit; a text of one number below such a name is a number."""
 
 
 @dataclass(frozen=True)
@@ -76,16 +80,26 @@ def key(name: str, unit: str = "") -> str:
 
 
 def jsonable(content: Any) -> Any:
-    """Content that JSON has: null for numbers that are not finite, lists for texts of numbers and commas."""
+    """Content that JSON has: null for numbers that are not finite, numbers and lists for texts of numbers."""
     if isinstance(content, dict):
-        return {str(name): jsonable(value) for name, value in content.items()}
+        return {str(name): jsonable(_number(name, value)) for name, value in content.items()}
     if isinstance(content, list | tuple):
         return [jsonable(value) for value in content]
     if isinstance(content, float) and not math.isfinite(content):
         return None
     if isinstance(content, str) and _NUMBERS.fullmatch(content):
-        return [float(number) for number in content.split(", ")]
+        return [_float(number) for number in re.findall(_NUMBER, content)]
     return content if content is None or isinstance(content, str | int | float) else _plain(content)
+
+
+def _number(name: Any, value: Any) -> Any:
+    """A text of one number below a name that ends in a unit as a number; any other value as it is."""
+    known = isinstance(value, str) and re.fullmatch(_NUMBER, value) and _UNITS.fullmatch(str(name))
+    return _float(value) if known else value
+
+
+def _float(text: str) -> float:
+    return float(text.replace(",", ""))
 
 
 def _plain(content: Any) -> Any:

@@ -35,11 +35,18 @@ SHOWN = (
     "validate IN/room/room.usda --against core --out found.json",
     "bench compare IN/results IN/results",
     "doctor",
+    "info lab",
+    "info IN/run.parquet",
+    "info IN/map.usdc",
+    "map info lab",
+    "dataset info IN/set",
+    "info IN/net.safetensors",
     "completion bash",
 )
 """Other commands."""
 
-WHOLE = ("completion bash",)
+WHOLE = ("completion bash", *(words for words in SHOWN if "info" in words))
+"""Those that print all that there is."""
 
 DATA = {
     "compare": "agreements",
@@ -75,6 +82,23 @@ def keys(content, *, by_name=False):
         yield from keys(value, by_name=by_name)
 
 
+NUMBERS = re.compile(r"[\d(][\d ,.()+-]*((x|y|z|to|of|\.\.)[\d ,.()+-]+)*|x -?\d.*\.\..*")
+"""Texts that are made of numbers for eyes: 10 x 7, 25,000 to 31,512, (1, 2), 0.4."""
+
+PLAIN = re.compile(r"\d{4}-\d\d-\d\d|\d+\.\d+\.[\d.]+")
+"""Dates and versions."""
+
+
+def for_eyes(content, name=""):
+    """Texts of numbers in JSON, by their keys; notes are for people."""
+    for key, value in content.items() if isinstance(content, dict) else ():
+        yield from for_eyes(value, key) if key not in ("notes", "wrote", "next", "packages") else ()
+    for value in content if isinstance(content, list) else ():
+        yield from for_eyes(value, name)
+    if isinstance(content, str) and NUMBERS.fullmatch(content) and not PLAIN.fullmatch(content):
+        yield f"{name}: {content}"
+
+
 def typed(words, capsys):
     """Stdout and stderr of a command that ends well, or finds something."""
     capsys.readouterr()
@@ -103,6 +127,7 @@ def test_a_command_prints_few_lines_and_typed_again_it_writes_beside_and_says_so
     out, told = typed([*words, "--json"], capsys)
     content = json.loads(out, parse_constant=lambda text: pytest.fail(f"{text} is no JSON"))
     assert all(re.fullmatch(r"[a-z][a-z0-9_]*", found) for found in keys(content)), [*keys(content)]
+    assert not [*for_eyes(content)]
     if known := DATA.get(name, DATA.get(words[0], "")):
         assert known in [*keys(content)]
         assert f"`{known}`" in (ROOT / "docs" / "output.md").read_text(encoding="utf-8")

@@ -127,9 +127,8 @@ def run(
         Duration of the run [s]. If it is longer than one pass along the path, the robot drives further laps.
         Default: once along the path.
     out
-        Output; may be repeated. A file gets the format of its suffix: .rrd, .parquet, .mcap, .csv, .npz,
-        .usd, .usda or .usdc. A name without a suffix is a folder with run.rrd, run.parquet and run.png.
-        Default: the folder run.
+        Folder to make, with run.rrd, run.parquet and run.png, or file to write, in the format of its suffix:
+        .rrd, .parquet, .mcap, .csv, .npz, .usd, .usda or .usdc. May be repeated. Default: the folder run.
     scans
         Cast the LiDAR's rays while it spins. Files .rrd and .mcap contain the scans. For .parquet, .csv and
         .npz, the scans go into a second file such as run.scans.parquet.
