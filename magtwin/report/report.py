@@ -9,11 +9,9 @@ from typing import Any
 from magtwin.report.summary import LINES, Summarized, Summary
 
 _NUMBER = r"[+-]?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e[+-]?\d+)?"
-_NUMBERS = re.compile(rf"\(?(?:x )?{_NUMBER}(?:(?:, [xyz ]*| x | to | of |\.\.){_NUMBER})+\)?")
-"""A text of several numbers, such as the place of a sensor, a size or a range."""
-
-_UNITS = re.compile(r".*_(?:m|s|nt|hz|deg|rad|kg|v|a)")
-"""Names that end in a unit; a text of one number below such a name is a number."""
+_NUMBERS = re.compile(rf"\(?(?:x )?{_NUMBER}(?:(?:, [xyz ]*| x | to | of |\.\.){_NUMBER})*\)?")
+_MEASURE = re.compile(r".*_(?:m|s|nt|hz|deg|rad|kg|v|a)")
+"""A text of numbers, such as a place or a range; names with a unit, where one number is no text."""
 
 
 @dataclass(frozen=True)
@@ -79,27 +77,18 @@ def key(name: str, unit: str = "") -> str:
     return words if f"_{words}".endswith(f"_{ending}") or not ending else f"{words}_{ending}"
 
 
-def jsonable(content: Any) -> Any:
-    """Content that JSON has: null for numbers that are not finite, numbers and lists for texts of numbers."""
+def jsonable(content: Any, name: str = "") -> Any:
+    """Content that JSON has: null for numbers that are not finite, and numbers for texts of numbers."""
     if isinstance(content, dict):
-        return {str(name): jsonable(_number(name, value)) for name, value in content.items()}
+        return {str(key): jsonable(value, str(key)) for key, value in content.items()}
     if isinstance(content, list | tuple):
         return [jsonable(value) for value in content]
     if isinstance(content, float) and not math.isfinite(content):
         return None
     if isinstance(content, str) and _NUMBERS.fullmatch(content):
-        return [_float(number) for number in re.findall(_NUMBER, content)]
+        numbers = [float(number.replace(",", "")) for number in re.findall(_NUMBER, content)]
+        return numbers if len(numbers) > 1 else numbers[0] if _MEASURE.fullmatch(name) else content
     return content if content is None or isinstance(content, str | int | float) else _plain(content)
-
-
-def _number(name: Any, value: Any) -> Any:
-    """A text of one number below a name that ends in a unit as a number; any other value as it is."""
-    known = isinstance(value, str) and re.fullmatch(_NUMBER, value) and _UNITS.fullmatch(str(name))
-    return _float(value) if known else value
-
-
-def _float(text: str) -> float:
-    return float(text.replace(",", ""))
 
 
 def _plain(content: Any) -> Any:

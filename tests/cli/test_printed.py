@@ -85,17 +85,14 @@ def keys(content, *, by_name=False):
 NUMBERS = re.compile(r"[\d(][\d ,.()+-]*((x|y|z|to|of|\.\.)[\d ,.()+-]+)*|x -?\d.*\.\..*")
 """Texts that are made of numbers for eyes: 10 x 7, 25,000 to 31,512, (1, 2), 0.4."""
 
-PLAIN = re.compile(r"\d{4}-\d\d-\d\d|\d+\.\d+\.[\d.]+")
-"""Dates and versions."""
-
 
 def for_eyes(content, name=""):
-    """Texts of numbers in JSON, by their keys; notes are for people."""
-    for key, value in content.items() if isinstance(content, dict) else ():
-        yield from for_eyes(value, key) if key not in ("notes", "wrote", "next", "packages") else ()
-    for value in content if isinstance(content, list) else ():
-        yield from for_eyes(value, name)
-    if isinstance(content, str) and NUMBERS.fullmatch(content) and not PLAIN.fullmatch(content):
+    """Texts of numbers in JSON, by their keys, but for dates and versions; notes are for people."""
+    if isinstance(content, dict | list):
+        for key, value in content.items() if isinstance(content, dict) else ((name, x) for x in content):
+            if key not in ("notes", "wrote", "next", "packages", "version", "magtwin", "created", "numpy"):
+                yield from for_eyes(value, key)
+    elif isinstance(content, str) and NUMBERS.fullmatch(content):
         yield f"{name}: {content}"
 
 

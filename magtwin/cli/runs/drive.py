@@ -10,8 +10,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from magtwin.cli import options as opt
 from magtwin.cli.app import app
-from magtwin.cli.options import Folder, Force, Gamepad, Lab, MapLayer, Network, Plant, Seed, Session
 from magtwin.cli.runs.run import SHOWN, save_picture
 from magtwin.cli.terminal import Done, named, note, silence, step
 from magtwin.errors import InputError
@@ -25,18 +25,18 @@ STATUS_HZ = 10.0
 
 @app.command
 def drive(
-    scene: Path,
+    scene: opt.Scene,
     *,
-    out: Folder = Path("drive"),
-    lab: Lab = "",
-    map_layer: MapLayer = None,
-    gamepad: Gamepad = None,
-    network: Network = None,
-    seed: Seed = 0,
-    session: Session = None,
-    plant: Plant = None,
+    out: opt.Folder = Path("drive"),
+    lab: opt.Lab = "",
+    map_layer: opt.MapLayer = None,
+    gamepad: opt.Gamepad = None,
+    network: opt.Network = None,
+    seed: opt.Seed = 0,
+    session: opt.Session = None,
+    plant: opt.Plant = None,
     live: bool = True,
-    force: Force = False,
+    force: opt.Force = False,
 ) -> Done:
     """Drive a scene's robot by hand, in real time, and write the run.
 
@@ -46,8 +46,6 @@ def drive(
 
     Parameters
     ----------
-    scene
-        USD stage to drive in, or the name of a scene that ships with magtwin: lab.
     live
         Show the drive in a Rerun viewer while it goes on, if a window can be opened.
     """
@@ -62,7 +60,7 @@ def drive(
     from magtwin.sim.motion.commands import read_commands, write_commands
     from magtwin.sim.motion.drive import draw_wheel_errors
     from magtwin.sim.motion.follow import CONTROL_RATE_HZ, STAND, loop_by_commands
-    from magtwin.sim.motion.manual import HELP, Gamepad, Keyboard, Recorder
+    from magtwin.sim.motion.manual import HELP, Keyboard, Recorder
     from magtwin.sim.runs.sensing import streams
     from magtwin.twin import in_session, open_twin, with_plant
 
@@ -80,7 +78,7 @@ def drive(
         start: Any = {"start": twin.scene.start, "footprint_radius_m": robot.footprint_radius_m}
         loop = loop_by_commands(STAND, robot.drive, wheel_errors=errors, **start)
         chassis = Chassis(loop, twin.obstacles)
-        hand: Hand = Keyboard(robot.drive) if gamepad is None else Gamepad(robot.drive)
+        hand: Hand = Keyboard(robot.drive) if gamepad is None else opt.Gamepad(robot.drive)
         recorder = Recorder(chassis, hand, dt)
         with ExitStack() as stack:
             show = None
