@@ -118,7 +118,7 @@ def draw_map(
     if legend:
         figure.legend(legend.values(), legend.keys(), loc="outside lower right", ncols=3)
     if not several:
-        figure.suptitle(_summary(fields[0], 100 if len(panels) > 1 else 46), x=0.01, ha="left")
+        figure.suptitle(_summary(fields[0], 125 if len(panels) > 1 else 46), x=0.01, ha="left")
     return figure
 
 

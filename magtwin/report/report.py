@@ -10,8 +10,7 @@ from magtwin.report.summary import LINES, Summarized, Summary
 
 _NUMBER = r"[+-]?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e[+-]?\d+)?"
 _NUMBERS = re.compile(rf"\(?(?:x )?{_NUMBER}(?:(?:, [xyz ]*| x | to | of |\.\.){_NUMBER})*\)?")
-_MEASURE = re.compile(r".*_(?:m|s|nt|hz|deg|rad|kg|v|a)")
-"""A text of numbers, such as a place or a range; names with a unit, where one number is no text."""
+"""A text of numbers, such as a place or a range."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +85,10 @@ def jsonable(content: Any, name: str = "") -> Any:
     if isinstance(content, float) and not math.isfinite(content):
         return None
     if isinstance(content, str) and _NUMBERS.fullmatch(content):
-        numbers = [float(number.replace(",", "")) for number in re.findall(_NUMBER, content)]
-        return numbers if len(numbers) > 1 else numbers[0] if _MEASURE.fullmatch(name) else content
+        found = [float(number.replace(",", "")) for number in re.findall(_NUMBER, content)]
+        return (
+            found if len(found) > 1 else found[0] if re.search("_([msva]|nt|hz|deg|kg)$", name) else content
+        )
     return content if content is None or isinstance(content, str | int | float) else _plain(content)
 
 

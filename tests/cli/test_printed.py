@@ -35,13 +35,7 @@ SHOWN = (
     "validate IN/room/room.usda --against core --out found.json",
     "bench compare IN/results IN/results",
     "doctor",
-    "info lab",
-    "info IN/run.parquet",
-    "info IN/map.usdc",
-    "map info lab",
-    "dataset info IN/set",
-    "info IN/net.safetensors",
-    "completion bash",
+    *("info lab", "info IN/run.parquet", "map info lab", "dataset info IN/set", "completion bash"),
 )
 """Other commands."""
 
