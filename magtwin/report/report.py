@@ -51,10 +51,9 @@ class Report(Summarized):
                 figures[key(f"{f.name.removesuffix('_nt')} sd", f.unit)] = f.spread
             notes |= {name: f.note} if f.note else {}
         facts = {key(name): value for name, value in self.metadata.items()}
-        content = {"title": self.title} | ({"verdict": self.verdict} if self.verdict else {})
-        return json.dumps(
-            jsonable(content | {"figures": figures, "notes": notes, "metadata": facts}), indent=2
-        )
+        content: dict[str, Any] = {"title": self.title} | ({"verdict": self.verdict} if self.verdict else {})
+        content |= {"figures": figures, "notes": notes, "metadata": facts}
+        return json.dumps(jsonable(content), indent=2)
 
     def _summary(self) -> Summary:
         """The figures; a notebook also shows the metadata."""
@@ -86,15 +85,11 @@ def jsonable(content: Any, name: str = "") -> Any:
         return None
     if isinstance(content, str) and _NUMBERS.fullmatch(content):
         found = [float(number.replace(",", "")) for number in re.findall(_NUMBER, content)]
-        return (
-            found if len(found) > 1 else found[0] if re.search("_([msva]|nt|hz|deg|kg)$", name) else content
-        )
-    return content if content is None or isinstance(content, str | int | float) else _plain(content)
-
-
-def _plain(content: Any) -> Any:
-    """A numpy number or array, or another object as text."""
-    return jsonable(content.tolist()) if hasattr(content, "tolist") else str(content)
+        one = found[0] if re.search("_([msva]|nt|hz|deg|rad|kg)$", name) else content
+        return found if len(found) > 1 else one
+    if hasattr(content, "tolist"):  # a numpy number or array
+        return jsonable(content.tolist())
+    return content if content is None or isinstance(content, str | int | float) else str(content)
 
 
 def _text(figure: Figure) -> str:
