@@ -60,7 +60,7 @@ def drive(
     from magtwin.sim.motion.commands import read_commands, write_commands
     from magtwin.sim.motion.drive import draw_wheel_errors
     from magtwin.sim.motion.follow import CONTROL_RATE_HZ, STAND, loop_by_commands
-    from magtwin.sim.motion.manual import HELP, Keyboard, Recorder
+    from magtwin.sim.motion.manual import HELP, Gamepad, Keyboard, Recorder
     from magtwin.sim.runs.sensing import streams
     from magtwin.twin import in_session, open_twin, with_plant
 
@@ -78,7 +78,7 @@ def drive(
         start: Any = {"start": twin.scene.start, "footprint_radius_m": robot.footprint_radius_m}
         loop = loop_by_commands(STAND, robot.drive, wheel_errors=errors, **start)
         chassis = Chassis(loop, twin.obstacles)
-        hand: Hand = Keyboard(robot.drive) if gamepad is None else opt.Gamepad(robot.drive)
+        hand: Hand = Keyboard(robot.drive) if gamepad is None else Gamepad(robot.drive)
         recorder = Recorder(chassis, hand, dt)
         with ExitStack() as stack:
             show = None
