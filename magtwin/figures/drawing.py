@@ -102,7 +102,7 @@ def _way(paths: Sequence[Path], suffix: str, show: Show | None, given: dict[str,
     if suffix in FILMS:
         return "film"
     looks = show == "picture" or (show is None and given.keys() & {"camera", "at_s"})
-    if show not in (None, "charts", "picture") or _is_survey(path):
+    if show not in (None, "charts", "picture") or _is_survey(path) or (suffix == ".html" and not runs[0]):
         return "map"
     if not runs[0]:
         return "map" if not looks and ending != ".usdz" and is_map_layer(path) else "stage"
