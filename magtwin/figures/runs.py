@@ -36,10 +36,7 @@ DASHES: dict[str, Any] = {"ls": (0, (6, 1.2))}
 
 @style.styled
 def draw_run(
-    run: Run,
-    field: AnomalyMap | None = None,
-    planned: ArrayLike | None = None,
-    plan: FloorPlan | None = None,
+    run: Run, field: AnomalyMap | None = None, planned: ArrayLike | None = None, plan: FloorPlan | None = None
 ) -> Figure:
     """Draw a run: the path, and against time what the map lacks, what was predicted of it, and the rest.
 
@@ -262,11 +259,7 @@ def _has(run: Run, *names: str) -> bool:
 
 
 @style.styled
-def path_picture(
-    run: Run,
-    field: AnomalyMap | None,
-    planned: ArrayLike | None,
-) -> canvas.Picture | None:
+def path_picture(run: Run, field: AnomalyMap | None, planned: ArrayLike | None) -> canvas.Picture | None:
     """The path of a run over its map, or over a bare floor; None if its places or readings are unknown."""
     position, column = position_name(run), field_name(run)
     if position is None or column is None or len(_places(run, position)) < 2:

@@ -86,7 +86,7 @@ def for_eyes(content, name=""):
         for key, value in content.items() if isinstance(content, dict) else ((name, x) for x in content):
             if key not in ("notes", "wrote", "next", "packages", "version", "magtwin", "created", "numpy"):
                 yield from for_eyes(value, key)
-    elif isinstance(content, str) and NUMBERS.fullmatch(content):
+    elif isinstance(content, str) and re.fullmatch(rf"(?!\d+\.\d+\.\d+$)({NUMBERS.pattern})", content):
         yield f"{name}: {content}"
 
 

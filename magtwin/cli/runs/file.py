@@ -30,10 +30,7 @@ def info(file: Path, *, recorded: opt.RecordedOptions = opt.RECORDED) -> Done:
 
 @app.command
 @opt.reads_recordings
-def view(
-    *files: Annotated[Path, Parameter(required=True)],
-    scene: opt.RunScene = None,
-) -> Done:
+def view(*files: Annotated[Path, Parameter(required=True)], scene: opt.RunScene = None) -> Done:
     """Show runs or a stage in a viewer until it is closed.
 
     Runs are shown in the Rerun viewer, in their lab if their scene is found. Several runs share one timeline,
