@@ -39,7 +39,7 @@ def draw(
     *,
     show: Show | None = None,
     force: bool = False,
-    advance: Callable[[int, int, str], None] = lambda done, total, what: None,
+    advance: Callable[[int, int], None] = lambda done, total: None,
     **options: Any,
 ) -> tuple[Path, Sequence[str]]:
     """Draw a run, a stage, a map or a recording; or compare two runs or two maps in a picture.
@@ -50,7 +50,7 @@ def draw(
         show: What to draw of a run, or of a map, a stage's too. None: charts of a run unless `at_s` or
             `camera` asks for a picture; a recording as its viewer shows it; a map's overview; a stage.
         force: Whether an existing output is replaced.
-        advance: Called with the frames of a film that are drawn, their number, and a hint.
+        advance: Called with the frames of a film that are drawn, and their number.
         options: at_s [s], camera, size [pixels], scene, headings [rad], pace and fps, as far as what is drawn
             has them (`WAYS`).
 
@@ -139,7 +139,7 @@ def _draw(
     show: Show | None,
     *,
     force: bool = False,
-    advance: Callable[[int, int, str], None],
+    advance: Callable[[int, int], None],
     **given: Any,
 ) -> Sequence[str]:
     """Draw files in a way; messages of the Rerun viewer."""

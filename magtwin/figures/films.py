@@ -34,9 +34,6 @@ MOST_FRAMES = {".mp4": 100_000, ".gif": 2_000}
 MOST_FPS = {".mp4": 120.0, ".gif": 50.0}
 """Frame rates. GIF counts in hundredths of a second, and viewers slow down frames shorter than two."""
 
-MANY, FASTER = 200, "faster with --size 640x360, --fps 10 or a higher --pace"
-"""Frames above which drawing takes a while, and what is said then."""
-
 LEAST_FPS = 0.01
 """Lowest frame rate. GIF stores the duration of a frame in 16 bits."""
 
@@ -51,12 +48,12 @@ def film_of_run(
     camera: str = "orbit",
     size: tuple[int, int] | None = None,
     force: bool = False,
-    advance: Callable[[int, int, str], None] = lambda done, total, what: None,
+    advance: Callable[[int, int], None] = lambda done, total: None,
 ) -> Path:
     """Draw a run as a film.
 
     Default of `speed` relative to the run: 1, or more for a film of at most 30 s; of `size`: `SIZES`.
-    `camera` is as for `View.of`; `advance` is called with the frames drawn, the number of all, and a hint.
+    `camera` is as for `View.of`; `advance` is called with the number of frames drawn, and their total.
 
     Raises:
         InputError: As for `magtwin.figures.scenery.Scenery`; an option is out of range; `out` is not a film,
@@ -81,7 +78,7 @@ def film_of_run(
         def frames() -> Generator[Image, None, None]:
             for k in range(len(times)):
                 yield scenery.frame(k)
-                advance(k + 1, len(times), FASTER if len(times) > MANY else "")
+                advance(k + 1, len(times))
 
         with output(out, force=force) as aside, closing(frames()) as images:
             if suffix == ".gif":
