@@ -40,7 +40,6 @@ SHOWN = (
 """Other commands."""
 
 WHOLE = ("completion bash", *(words for words in SHOWN if "info" in words))
-"""Those that print all that there is."""
 
 DATA = {
     "compare": "agreements",
@@ -76,8 +75,7 @@ def keys(content, *, by_name=False):
         yield from keys(value, by_name=by_name)
 
 
-NUMBERS = re.compile(r"[\d(][\d ,.()+-]*((x|y|z|to|of|\.\.)[\d ,.()+-]+)*|x -?\d.*\.\..*")
-"""Texts that are made of numbers for eyes: 10 x 7, 25,000 to 31,512, (1, 2), 0.4."""
+NUMBERS = r"[\d(][\d ,.()+-]*((x|y|z|to|of|\.\.)[\d ,.()+-]+)*|x -?\d.*"  # 10 x 7, 25,000 to 31, (1, 2)
 
 
 def for_eyes(content, name=""):
@@ -86,7 +84,7 @@ def for_eyes(content, name=""):
         for key, value in content.items() if isinstance(content, dict) else ((name, x) for x in content):
             if key not in ("notes", "wrote", "next", "packages", "version", "magtwin", "created", "numpy"):
                 yield from for_eyes(value, key)
-    elif isinstance(content, str) and re.fullmatch(rf"(?!\d+\.\d+\.\d+$)({NUMBERS.pattern})", content):
+    elif isinstance(content, str) and re.fullmatch(rf"(?!\d+\.\d+\.\d+$)({NUMBERS})", content):
         yield f"{name}: {content}"
 
 

@@ -111,6 +111,8 @@ def told(capsys, *words):
 def test_help_is_a_command_too_and_h_is_short(capsys):
     assert told(capsys, "help", "plot") == told(capsys, "plot", "--help")
     assert len(told(capsys, "plot", "-h")) < 0.7 * len(told(capsys, "plot", "--help"))
+    assert "Default: the folder run.\n" in told(capsys, "run", "-h")
+    assert "[default: False]" not in told(capsys, "run", "--help")
     assert told(capsys, "help", "look") in told(capsys, "help")
     assert told(capsys, "-V") == told(capsys, "version")
     assert told(capsys) == told(capsys, "--help") == told(capsys, "-h")
