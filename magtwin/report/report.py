@@ -9,7 +9,7 @@ from typing import Any
 from magtwin.report.summary import LINES, Summarized, Summary
 
 _NUMBER = r"[+-]?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e[+-]?\d+)?"
-_NUMBERS = re.compile(rf"\(?(?:x )?{_NUMBER}(?:(?:, [xyz ]*| x | to | of |\.\.){_NUMBER})*\)?")
+_NUMBERS = re.compile(rf"\(?(?:x )?{_NUMBER}(?:(?:, [xyz ]*| x | to | of |\.\.| ){_NUMBER})*\)?")
 """A text of numbers, such as a place or a range."""
 
 

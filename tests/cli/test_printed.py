@@ -75,7 +75,7 @@ def keys(content, *, by_name=False):
         yield from keys(value, by_name=by_name)
 
 
-NUMBERS = r"[\d(][\d ,.()+-]*((x|y|z|to|of|\.\.)[\d ,.()+-]+)*|x -?\d.*"  # 10 x 7, 25,000 to 31, (1, 2)
+NUMBERS = r"\(?(x )?-?\d[\d,]*(\.\d+)?(([ ,.xyz]|to|of)+-?\d[\d,]*(\.\d+)?)*\)?"  # 10 x 7, (1, 2), 25,000
 
 
 def for_eyes(content, name=""):
