@@ -20,7 +20,7 @@ REFUSALS = [
     (f"convert run.npz {BYTES}.parquet", "its name is not UTF-8"),
     ("convert loop a.csv", "links form a circle"),
     ("run lab --out loop/x.csv", "links form a circle"),
-    ("info a.txt", "no rows below the header"),
+    ("info a.txt", "a.txt: empty; expected one row of numbers per reading"),
     ("map import nowhere --out new.usdc", "nowhere: no such"),
     ("drive lab --gamepad js0 --out new", "no such gamepad"),
     ("drive lab --gamepad room --out new", "room: a folder; name a gamepad in it"),
