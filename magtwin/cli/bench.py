@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import App, Parameter
 
+from magtwin.cli import options as opt
 from magtwin.cli.app import app
-from magtwin.cli.options import Dask, Flag, Force, Jobs, Names, Shard, Whole, pairs
 from magtwin.cli.terminal import Done, continued_by_a_repeat, named, progress, step
 
 ANEW = "Remove all results in the folder first, of all localizers."
@@ -23,15 +23,15 @@ def bench(
     suite: str,
     *,
     out: Path,
-    only: Names = None,
-    localizer: Names = None,
-    runs: Whole | None = None,
+    only: opt.Names = None,
+    localizer: opt.Names = None,
+    runs: opt.Whole | None = None,
     seeds: Literal["public", "held-out"] = "public",
     data: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
-    jobs: Jobs = None,
-    shard: Shard = None,
-    dask: Dask = None,
-    no_tracks: Flag = False,
+    jobs: opt.Jobs = None,
+    shard: opt.Shard = None,
+    dask: opt.Dask = None,
+    no_tracks: opt.Flag = False,
     force: Anew = False,
 ) -> Done:
     """Benchmark localizers on simulated and recorded drives, and report the results.
@@ -70,7 +70,7 @@ def bench(
 
     what: Any = {"scenarios": only or (), "localizers": localizer or (), "runs": runs, "seeds": seeds}
     with continued_by_a_repeat(), progress(f"Benchmarking {suite}", "runs") as advance:
-        what |= {"data": pairs("data", data, "NAME=FOLDER"), "tracks": not no_tracks, "force": force}
+        what |= {"data": opt.pairs("data", data, "NAME=FOLDER"), "tracks": not no_tracks, "force": force}
         how: Any = {"jobs": jobs, "dask": dask, "shard": None if shard is None else parse_shard(shard)}
         made = benchmark(suite, out, progress=advance, **what, **how)
     report = made.report(standings(made.rows, made.times, made.compensated))
@@ -79,7 +79,7 @@ def bench(
 
 
 @bench_app.command
-def report(*folders: Results, out: Path | None = None, force: Force = False) -> Done:
+def report(*folders: Results, out: Path | None = None, force: opt.Force = False) -> Done:
     """Write a report on results: leaderboard, distributions of errors, and errors over time.
 
     The report is a folder with bench.html, which is self-contained, bench.json, and the pictures.

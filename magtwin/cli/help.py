@@ -102,8 +102,11 @@ class Page:
         """Print a panel."""
         if self.short and panel.title == "Common":
             return
-        for entry in panel.entries if self.short else ():
-            entry.description = _first(console, entry.description)
+        for entry in panel.entries:
+            if entry.default in ("False", '""', "()"):  # of a flag, or of nothing
+                entry.default = None
+            if self.short:
+                entry.description = _first(console, entry.description, default=True)
         self.inner(console, options, panel)
 
     def render_usage(self, console: Any, options: Any, usage: Any) -> None:
@@ -117,10 +120,13 @@ class Page:
         console.print(f"{'' if not self.short else chr(10)}Examples:{made}\n" if made else "", markup=False)
 
 
-def _first(console: Any, text: Any) -> str:
-    """The first sentence of a text to print."""
+def _first(console: Any, text: Any, *, default: bool = False) -> str:
+    """The first sentence of a text to print, and the one that tells its default."""
     wide = console.options.update(width=100_000)
-    return first_sentence("".join(segment.text for segment in console.render(text, wide)) if text else "")
+    whole = " ".join("".join(each.text for each in console.render(text, wide) if text).split())
+    told = re.search(r"Default: .*", whole) if default else None
+    ending = f" {told[0]}" if told else ""
+    return f"{first_sentence(whole.removesuffix(ending))}{ending}".strip()
 
 
 def first_sentence(text: str) -> str:

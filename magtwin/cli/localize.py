@@ -5,31 +5,31 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+from magtwin.cli import options as opt
 from magtwin.cli.app import app
-from magtwin.cli.options import AnyRun, Folder, Force, Names, Seed, pairs, reads_recordings
 from magtwin.cli.ros import HERE, FramePrefix, WallS, Where, ros_app, spin
 from magtwin.cli.terminal import Done, announce, named, progress, step
 from magtwin.errors import InputError, hint
 
 
 @app.command
-@reads_recordings
+@opt.reads_recordings
 def localize(
-    run: AnyRun,
+    run: opt.AnyRun,
     *,
     map: str,  # noqa: A002 - the option is called --map
-    method: str = "rbpf-iron",
-    option: Names = None,
-    out: Folder = Path("localized"),
+    method: opt.Method = "rbpf-iron",
+    option: opt.OptionsOf = None,
+    out: opt.Folder = Path("localized"),
     prior: str = "tracking",
     rate_hz: float = 5.0,
-    sensor: Names = None,
-    odometry: Names = None,
-    map_length_m: float = 0.3,
+    sensor: opt.Sensor = None,
+    odometry: opt.Odometry = None,
+    map_length_m: opt.MapLength = 0.3,
     compensator: str = "none",
     calibration: Path | None = None,
-    seed: Seed = 0,
-    force: Force = False,
+    seed: opt.Seed = 0,
+    force: opt.Force = False,
 ) -> Done:
     """Localize a robot along a run by its magnetometer and odometry, and score the estimate.
 
@@ -43,26 +43,12 @@ def localize(
     map
         Map layer, stage, folder of survey CSVs, or the name of a scene that ships with magtwin (lab). none:
         no map, for the methods of simultaneous localization and mapping, such as incremental-slam.
-    method
-        Name of a method, such as rbpf or odometry; or a class of your own as MODULE:CLASS, in the current
-        folder or an installed package.
-    option
-        Options of the method, as NAME=VALUE.
     prior
         Start that the method is told: tracking (the true pose with errors of 0.1 m and 5 deg), heading (the
         heading within 10 deg; no position), global (nothing), or a pose x,y,yaw [m, m, rad]. For a negative
         x, write --prior=-1,0,0.
     rate_hz
         Readings per second that the method gets [Hz].
-    sensor
-        Values of the magnetometer's noise model that the method is told, as NAME=VALUE: white_nt (100),
-        drift_nt (250), drift_s (2.5), offset_nt (500), iron_nt (400), lever_arm_m (that of the run). The
-        defaults fit the shipped robot in a new session.
-    odometry
-        Values of the odometry's noise model that the method is told, as NAME=VALUE: position_std,
-        yaw_std, turn_std, position_std_s, yaw_std_s, scale_std. docs/localize.md has their defaults.
-    map_length_m
-        Correlation length of the map's error that the method is told [m].
     compensator
         Model of the robot's own field, whose prediction the method rbpf-network uses: none; iron,
         fitted to --calibration; or the weights of a trained network (.safetensors, .pth).
@@ -97,16 +83,16 @@ def localize(
 
 @ros_app.command(name="localize", usage="Usage: magtwin ros localize [OPTIONS] SCENE [SETTING...]")
 def localize_live(
-    scene: Path,
+    scene: opt.Scene,
     *settings: str,
     where: Where = HERE,
-    method: str = "rbpf-iron",
-    option: Names = None,
+    method: opt.Method = "rbpf-iron",
+    option: opt.OptionsOf = None,
     map: str | None = None,  # noqa: A002
-    sensor: Names = None,
-    odometry: Names = None,
-    map_length_m: float = 0.3,
-    seed: Seed = 0,
+    sensor: opt.Sensor = None,
+    odometry: opt.Odometry = None,
+    map_length_m: opt.MapLength = 0.3,
+    seed: opt.Seed = 0,
     frame_prefix: FramePrefix = None,
     duration_s: WallS = None,
 ) -> Done:
@@ -123,22 +109,10 @@ def localize_live(
 
     Parameters
     ----------
-    scene
-        USD stage that names the robot and the map, or the name of a scene that ships with magtwin: lab.
     settings
         Settings, such as prior:=global use_sim_time:=true.
-    method
-        Name of a method, or MODULE:CLASS, as for `magtwin localize`.
-    option
-        Options of the method, as NAME=VALUE.
     map
         Map to use instead of the scene's, as for `magtwin localize`. none: no map.
-    sensor
-        Values of the magnetometer's noise model, as for `magtwin localize`.
-    odometry
-        Values of the odometry's noise model, as for `magtwin localize`.
-    map_length_m
-        Correlation length of the map's error that the method is told [m].
     """
     from magtwin.localization.problem import OdometryModel, SensorModel
     from magtwin.ros.localization.localize import PARAMETERS, LocalizerNode
@@ -163,7 +137,7 @@ def localize_live(
 def _values(option: str, texts: list[str] | None, model: Any = None) -> dict[str, Any]:
     """NAME=VALUE texts with numbers, true, false and lists as in JSON; other values are texts."""
     values: dict[str, Any] = {}
-    for name, text in pairs(option, texts).items():
+    for name, text in opt.pairs(option, texts).items():
         try:
             value = json.loads(text)
         except ValueError:

@@ -78,6 +78,42 @@ def headings_rad(text: str) -> list[float]:
     return [radians(h) for h in degrees]
 
 
+Scene = Annotated[Path, Parameter(help="USD stage, or the name of a scene that ships with magtwin: lab.")]
+Weights = Annotated[Path, Parameter(help="Weights to write, .safetensors.")]
+TrainedMap = Annotated[
+    Path,
+    Parameter(help="Map that the weights were trained on: a layer or stage, or a folder of survey CSVs."),
+]
+Method = Annotated[
+    str,
+    Parameter(
+        help="Name of a method, such as rbpf or odometry; or a class of your own as MODULE:CLASS, in the "
+        "current folder or an installed package."
+    ),
+]
+Sensor = Annotated[
+    list[str] | None,
+    Parameter(
+        consume_multiple=True,
+        help="Values of the magnetometer's noise model that the method is told, as NAME=VALUE: "
+        "white_nt (100), drift_nt (250), drift_s (2.5), offset_nt (500), iron_nt (400), lever_arm_m "
+        "(that of the run). The defaults fit the shipped robot in a new session.",
+    ),
+]
+Odometry = Annotated[
+    list[str] | None,
+    Parameter(
+        consume_multiple=True,
+        help="Values of the odometry's noise model that the method is told, as NAME=VALUE: position_std, "
+        "yaw_std, turn_std, position_std_s, yaw_std_s, scale_std. docs/localize.md has their defaults.",
+    ),
+]
+OptionsOf = Annotated[
+    list[str] | None, Parameter(consume_multiple=True, help="Options of the method, as NAME=VALUE.")
+]
+MapLength = Annotated[
+    float, Parameter(help="Correlation length of the map's error that the method is told [m].")
+]
 Folder = Annotated[Path, Parameter(help="Folder to make.")]
 AnyRun = Annotated[Path, Parameter(help="A run in any format that magtwin reads.")]
 Whole = Annotated[int, Parameter(converter=_whole)]
@@ -110,11 +146,12 @@ Session = Annotated[
     int | Literal["survey"] | None,
     Parameter(
         converter=_session,
-        help="Number of the session. It and the seed determine battery charge, IMU offsets, wheels, odometry "
-        "and the robot's own field. survey: the robot as it was when the map was surveyed. Default: 0.",
+        show_choices=False,
+        help="Number of the session, in which the seed draws battery charge, IMU offsets, wheels, odometry "
+        "and the robot's own field; or survey, the robot as it was when the map was surveyed. Default: 0.",
     ),
 ]
-Sessions = Annotated[int | Literal["survey"] | None, Parameter(converter=_session)]
+Sessions = Annotated[int | Literal["survey"] | None, Parameter(converter=_session, show_choices=False)]
 Plant = Annotated[
     str | None,
     Parameter(

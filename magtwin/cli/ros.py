@@ -10,25 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, Parameter
 
+from magtwin.cli import options as opt
 from magtwin.cli.app import app
-from magtwin.cli.options import (
-    AnyRun,
-    Flag,
-    Force,
-    Lab,
-    Lidar,
-    MapLayer,
-    ModelError,
-    Network,
-    OutUnit,
-    Plant,
-    RateHz,
-    Seed,
-    Session,
-    Whole,
-    check_pace,
-    reads_recordings,
-)
 from magtwin.cli.terminal import Done, announce, named, progress, silence, step
 from magtwin.errors import InputError
 
@@ -56,7 +39,7 @@ class Node:
     remap: tuple[str, ...] = ()
     """Name of a topic on the network, as OURS:=THEIRS: odom:=/wheel/odom. May be repeated."""
 
-    domain: Whole | None = None
+    domain: opt.Whole | None = None
     """ROS domain, 0 to 232. Default: ROS_DOMAIN_ID."""
 
     backend: Literal["auto", "rclpy", "cyclonedds"] = "auto"
@@ -120,22 +103,22 @@ Asset = Annotated[
 
 @ros_app.command(name="sim")
 def sim(
-    scene: Path,
+    scene: opt.Scene,
     *,
     where: Where = HERE,
-    lab: Lab = "",
-    map_layer: MapLayer = None,
+    lab: opt.Lab = "",
+    map_layer: opt.MapLayer = None,
     pace: float = 1.0,
     duration_s: float | None = None,
-    seed: Seed = 0,
-    session: Session = None,
-    plant: Plant = None,
-    network: Network = None,
+    seed: opt.Seed = 0,
+    session: opt.Session = None,
+    plant: opt.Plant = None,
+    network: opt.Network = None,
     magnetometer: Literal["physical", "neural", "map-only", "none"] | None = None,
-    model_error: ModelError = True,
-    rate_hz: RateHz = None,
-    out_unit: OutUnit = None,
-    lidar: Lidar = "schedule",
+    model_error: opt.ModelError = True,
+    rate_hz: opt.RateHz = None,
+    out_unit: opt.OutUnit = None,
+    lidar: opt.Lidar = "schedule",
     frame_prefix: FramePrefix = None,
     tf: Literal["all", "odom", "none"] = "odom",
 ) -> Done:
@@ -147,8 +130,6 @@ def sim(
 
     Parameters
     ----------
-    scene
-        USD stage to simulate.
     pace
         Simulated seconds per second.
     duration_s
@@ -164,7 +145,7 @@ def sim(
     from magtwin.ros.simulate import Simulator
     from magtwin.twin import open_twin, with_plant
 
-    check_pace(pace)
+    opt.check_pace(pace)
     announce(f"opening {scene}")
     kind = None if magnetometer == "none" else magnetometer
     opening: Any = {"network": network, "magnetometer": kind, "model_error": model_error}
@@ -187,12 +168,12 @@ def sim(
 
 @ros_app.command(name="magnetometer", usage="Usage: magtwin ros magnetometer [OPTIONS] SCENE [SETTING...]")
 def magnetometer(
-    scene: Path,
+    scene: opt.Scene,
     *settings: str,
     where: Where = HERE,
-    lab: Lab = "",
-    map_layer: MapLayer = None,
-    network: Network = None,
+    lab: opt.Lab = "",
+    map_layer: opt.MapLayer = None,
+    network: opt.Network = None,
     online: str | None = None,
     measured: str | None = None,
     frame_prefix: FramePrefix = None,
@@ -208,8 +189,6 @@ def magnetometer(
 
     Parameters
     ----------
-    scene
-        USD stage that names the map, the network and the robot.
     settings
         Settings, such as units:=nT use_sim_time:=true.
     online
@@ -245,8 +224,8 @@ def follow(
     speed: float = 0.2,
     controller: Literal["follower", "release"] = "follower",
     source: Literal["truth", "estimate", "odometry"] = "truth",
-    laps: Whole = 1,
-    continuous: Flag = False,
+    laps: opt.Whole = 1,
+    continuous: opt.Flag = False,
     sim_time: SimTime = False,
     commands: Commands = "auto",
     stamps: Stamps = "header",
@@ -300,7 +279,7 @@ def record(
     where: Where = HERE,
     duration_s: WallS = None,
     sim_time: SimTime = False,
-    force: Force = False,
+    force: opt.Force = False,
 ) -> Done:
     """Record a robot's topics as a rosbag2, which magtwin convert, info, report and dataset read as a run.
 
@@ -341,16 +320,16 @@ def record(
 
 
 @ros_app.command(name="replay")
-@reads_recordings
+@opt.reads_recordings
 def replay(
-    run: AnyRun,
+    run: opt.AnyRun,
     *,
     topic: tuple[str, ...] = (),
     scene: Path | None = None,
     where: Where = HERE,
     pace: float = 1.0,
     stamps: Literal["run", "wall"] = "run",
-    out_unit: OutUnit = None,
+    out_unit: opt.OutUnit = None,
     frame_prefix: FramePrefix = None,
     tf: Literal["all", "odom", "none"] = "odom",
 ) -> Done:
@@ -373,7 +352,7 @@ def replay(
     from magtwin.ros.record import Player
     from magtwin.twin import open_twin
 
-    check_pace(pace)
+    opt.check_pace(pace)
     whole = read_run(run)
     twin = None if scene is None else open_twin(scene, model_error=False)
     with where.bus("magtwin_replay") as bus:

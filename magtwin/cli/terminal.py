@@ -80,9 +80,10 @@ class Done:
             if len(wrote) == 1 and Path(wrote[0]).is_dir():
                 inside = listed(sorted(file.name for file in Path(wrote[0]).glob("[!.]*")))
             told = ": ".join(filter(None, (said, self.text or inside)))
-            tail = [f"{told}; --force replaces" if renamed else told] if told else []
+            tail = [told] if told and not renamed else []
             tail += [f"{'       ' if k else 'Next:  '}{words}" for k, words in enumerate(following)]
-            for line in (*self._told(MOST_LINES - len(tail)), *tail):
+            head = [_bold(f"{told}; --force replaces")] if renamed else []
+            for line in (*head, *self._told(MOST_LINES - len(head) - len(tail)), *tail):
                 say(line)
         elif renamed:
             print_error(said)

@@ -66,7 +66,7 @@ def draw(
     suffix = out.suffix.lower()
     if not any(suffix in known for known in SUFFIXES.values()):
         raise InputError(f"{out}: a picture ends in .png, .svg or .jpg, and a film in .mp4 or .gif")
-    paths = [existing(shipped_or(file), "run, stage, map or recording") for file in files]
+    paths = [_layer_in(existing(shipped_or(file), "run, stage, map or recording")) for file in files]
     way = _way(paths, suffix, show, given)
     kind, what, takes = WAYS[way]
     if suffix not in SUFFIXES[kind]:
@@ -102,13 +102,22 @@ def _way(paths: Sequence[Path], suffix: str, show: Show | None, given: dict[str,
     if suffix in FILMS:
         return "film"
     looks = show == "picture" or (show is None and given.keys() & {"camera", "at_s"})
-    if show not in (None, "charts", "picture") or _is_survey(path):
+    if show not in (None, "charts", "picture") or _is_survey(path) or (suffix == ".html" and not runs[0]):
         return "map"
     if not runs[0]:
         return "map" if not looks and ending != ".usdz" and is_map_layer(path) else "stage"
     if ending == ".rrd" and show != "charts" and not given.keys() & {"camera", "scene"}:
         return "recording"
     return "moment" if looks else "charts"
+
+
+def _layer_in(path: Path) -> Path:
+    """The map layer of a folder that holds one and is of no other kind; any other path as it is."""
+    from magtwin.usd.maps.layer import is_map_layer
+
+    unknown = path.is_dir() and kind_of(path) is None
+    layers = [file for file in sorted(path.glob("*.usd[ac]")) if is_map_layer(file)] if unknown else []
+    return layers[0] if len(layers) == 1 else path
 
 
 def _is_survey(path: Path) -> bool:

@@ -6,20 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from magtwin.figures.canvas import (
-    WIDTH_IN,
-    Chart,
-    Picture,
-    colour_bar,
-    coloured_line,
-    draw_line,
-    evenly,
-    label,
-    legend_above,
-    new_figure,
-    picture,
-    short_name,
-)
+from magtwin.figures import canvas
 from magtwin.figures.maps import draw_mean
 from magtwin.figures.page import Page, Section, Table
 from magtwin.figures.reports import section_of_traversals
@@ -72,8 +59,8 @@ def page_of_evaluation(
     figures = [
         ("recordings", f"{len(evaluation.judged)} of {every.sessions} sessions"),
         ("readings", f"{best.rows:,}"),
-        (f"mean error, {short_name(evaluation.names[_best(evaluation)])}", f"{best.mae_nt:,.1f} nT"),
-        (f"mean error, {short_name(evaluation.names[0])}", f"{every.scores[0].mae_nt:,.1f} nT"),
+        (f"mean error, {canvas.short_name(evaluation.names[_best(evaluation)])}", f"{best.mae_nt:,.1f} nT"),
+        (f"mean error, {canvas.short_name(evaluation.names[0])}", f"{every.scores[0].mae_nt:,.1f} nT"),
         ("ratio", f"{best.ratio:.3f} ({best.ratio_interval[0]:.3f} to {best.ratio_interval[1]:.3f})"),
     ]
     lead = f"Errors: total field at the sensor, predicted minus {against}; all models on the same readings."
@@ -206,7 +193,7 @@ def _best(evaluation: Evaluation) -> int:
     return min(_trained(evaluation), key=lambda m: evaluation.every.scores[m].mae_nt)
 
 
-def _rank_correlations(evaluation: Evaluation) -> tuple[Picture, ...]:
+def _rank_correlations(evaluation: Evaluation) -> tuple[canvas.Picture, ...]:
     """Figure 2: correlation of each input with the disturbance, on the first map."""
     judged = evaluation.judged
     able = [name for name in FULL if all(one.run.keys() >= set(FEATURES[name].columns) for one in judged)]
@@ -227,10 +214,10 @@ def _rank_correlations(evaluation: Evaluation) -> tuple[Picture, ...]:
         return ()
     title = "Figure 2: Spearman's correlation of each input with the disturbance, beside the paper's"
     figure = draw_correlations(correlations(x, y, able, np.concatenate(groups)))
-    return (picture(figure, title, file="figure_2"),)
+    return (canvas.picture(figure, title, file="figure_2"),)
 
 
-def _time_series(evaluation: Evaluation) -> list[Chart]:
+def _time_series(evaluation: Evaluation) -> list[canvas.Chart]:
     """Figure 5: field as measured and by the map alone, and the errors of each model with their interval."""
     best = _best(evaluation)
     size = [float(np.mean(np.abs(one.errors().error_nt[best]))) for one in evaluation.judged]
@@ -239,11 +226,11 @@ def _time_series(evaluation: Evaluation) -> list[Chart]:
     seen = t <= SHOWN_S
     t, kept = t[seen], one.kept[seen]
     measured, alone = (np.where(kept, values[seen], np.nan) for values in (one.measured_nt, one.map_nt[0]))
-    rows, where = evenly(len(t), 900), f"{one.name} ({one.path})"
+    rows, where = canvas.evenly(len(t), 900), f"{one.name} ({one.path})"
 
     def field(ax: Axes) -> None:
-        draw_line(ax, t, measured, **SERIES[0], label="measured")
-        draw_line(ax, t, alone, **SERIES[1], label="map alone")
+        canvas.draw_line(ax, t, measured, **SERIES[0], label="measured")
+        canvas.draw_line(ax, t, alone, **SERIES[1], label="map alone")
         finish(ax, "total field [nT]")
 
     def errors(m: int) -> Callable[[Axes], None]:
@@ -252,8 +239,8 @@ def _time_series(evaluation: Evaluation) -> list[Chart]:
         half = Z_90 * one.sd_nt[m, seen][rows]
 
         def draw(ax: Axes) -> None:
-            draw_line(ax, t, lacks, color=FAINT, label="map alone")
-            draw_line(ax, t, error, **_look(m), label="map and model")
+            canvas.draw_line(ax, t, lacks, color=FAINT, label="map alone")
+            canvas.draw_line(ax, t, error, **_look(m), label="map and model")
             if np.isfinite(half).any():
                 band = {"color": _look(m)["color"], "alpha": 0.2, "lw": 0}
                 ax.fill_between(t[rows], -half, half, label=f"its {COVERED:.0%} interval", **band)
@@ -264,45 +251,46 @@ def _time_series(evaluation: Evaluation) -> list[Chart]:
 
     def finish(ax: Axes, y: str) -> None:
         ax.margins(x=0)
-        label(ax, "time [s]", y)
-        legend_above(ax, 2)
+        canvas.label(ax, "time [s]", y)
+        canvas.legend_above(ax, 2)
 
-    charts = [Chart(f"Figure 5: total field of {where}", field, file="figure_5_field")]
+    charts = [canvas.Chart(f"Figure 5: total field of {where}", field, file="figure_5_field")]
     for m in _trained(evaluation):
         off = np.abs(one.total_nt[m, seen] - one.measured_nt[seen])[kept]
         mae = np.nanmean(off) if np.isfinite(off).any() else np.nan
-        title = f"Figure 5: errors of {short_name(evaluation.names[m], 40)} on {where}"
-        charts.append(Chart(f"{title}: mean size {mae:.0f} nT", errors(m), file=f"figure_5_{m}"))
+        title = f"Figure 5: errors of {canvas.short_name(evaluation.names[m], 40)} on {where}"
+        charts.append(canvas.Chart(f"{title}: mean size {mae:.0f} nT", errors(m), file=f"figure_5_{m}"))
     return charts
 
 
 @styled
-def _floor_plan(evaluation: Evaluation) -> list[Picture]:
+def _floor_plan(evaluation: Evaluation) -> list[canvas.Picture]:
     """Figure 7: paths over the map, coloured by the error of the best model."""
     cases = list(dict.fromkeys(one.case for one in evaluation.judged))[:MOST_PANELS]
     shown = [next(one for one in evaluation.judged if one.case == case) for case in cases]
     best = _best(evaluation)
     named = evaluation.candidates[best].map
     x0, x1, y0, y1 = named.field.extent
-    height = float(np.clip((WIDTH_IN - 0.8) * (y1 - y0) / (x1 - x0), 1.2, 6.0))
+    height = float(np.clip((canvas.WIDTH_IN - 0.8) * (y1 - y0) / (x1 - x0), 1.2, 6.0))
     errors = [np.where(one.kept, one.total_nt[best] - one.measured_nt, np.nan) for one in shown]
     reach = float(np.nanquantile(np.abs(np.concatenate(errors)), 0.99))
     pictures = []
     for k, (one, error) in enumerate(zip(shown, errors, strict=True)):
-        figure = new_figure(WIDTH_IN, height + 1.9)
+        figure = canvas.new_figure(canvas.WIDTH_IN, height + 1.9)
         ax, place = figure.subplots(), np.isfinite(one.p_xy).all(axis=1)
         draw_mean(ax, named.field)
-        ax.plot(*one.p_xy[place][evenly(int(place.sum()), 3000)].T, color=INK, lw=3.8)
-        line = coloured_line(ax, one.p_xy[place], error[place], (-reach, reach), SIGNED_COLOURS, 2.6)
-        colour_bar(figure, line, ax, "error [nT]", below=True, extend="both")
-        label(ax, "x [m]", "y [m]")
+        ax.plot(*one.p_xy[place][canvas.evenly(int(place.sum()), 3000)].T, color=INK, lw=3.8)
+        line = canvas.coloured_line(ax, one.p_xy[place], error[place], (-reach, reach), SIGNED_COLOURS, 2.6)
+        canvas.colour_bar(figure, line, ax, "error [nT]", below=True, extend="both")
+        canvas.label(ax, "x [m]", "y [m]")
         case = one.case if one.case == one.path else f"{one.case} ({one.path})"
-        title = f"Figure 7: {case}, error of {short_name(evaluation.names[best])} over the map {named.name}"
-        pictures.append(picture(figure, title, file=f"figure_7_{k}"))
+        model = canvas.short_name(evaluation.names[best])
+        title = f"Figure 7: {case}, error of {model} over the map {named.name}"
+        pictures.append(canvas.picture(figure, title, file=f"figure_7_{k}"))
     return pictures
 
 
-def _path_errors(evaluation: Evaluation) -> Chart:
+def _path_errors(evaluation: Evaluation) -> canvas.Chart:
     """Figure 6 a and b: errors by path, with their intervals."""
     cases = [case for case in evaluation.cases if case.name != "all"]
     count = len(evaluation.candidates)
@@ -314,15 +302,15 @@ def _path_errors(evaluation: Evaluation) -> Chart:
             mae = np.array([case.scores[m].mae_nt for case in cases])
             low, high = np.array([case.scores[m].mae_interval_nt for case in cases]).T
             hatch = ("", "//", "..")[(m - 1) // 7 % 3] if m else ""
-            ax.bar(at, mae, 0.92 * width, color=_look(m)["color"], hatch=hatch, label=short_name(name))
+            ax.bar(at, mae, 0.92 * width, color=_look(m)["color"], hatch=hatch, label=canvas.short_name(name))
             spread = np.nan_to_num(np.stack([mae - low, high - mae]).clip(0))
             ax.errorbar(at, mae, yerr=spread, fmt="none", ecolor=INK, elinewidth=0.8, capsize=1.5)
-        ax.set_xticks(np.arange(len(cases)), [short_name(case.name, 12) for case in cases])
+        ax.set_xticks(np.arange(len(cases)), [canvas.short_name(case.name, 12) for case in cases])
         ax.set_ylim(bottom=0)
-        label(ax, y="mean absolute error [nT]")
+        canvas.label(ax, y="mean absolute error [nT]")
         ax.grid(axis="y")
-        legend_above(ax, 1 if max(map(len, evaluation.names)) > 18 else 2)
+        canvas.legend_above(ax, 1 if max(map(len, evaluation.names)) > 18 else 2)
 
     rows = count if max(map(len, evaluation.names)) > 18 else -(-count // 2)
     title = f"Figure 6 a, b: errors by path, with {LEVEL:.0%} intervals"
-    return Chart(title, draw, 2.6 + 0.19 * rows, "figure_6ab")
+    return canvas.Chart(title, draw, 2.6 + 0.19 * rows, "figure_6ab")

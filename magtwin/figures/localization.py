@@ -21,18 +21,6 @@ from matplotlib.ticker import FuncFormatter
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.figures import canvas
-from magtwin.figures.canvas import (
-    Array,
-    Chart,
-    draw_line,
-    evenly,
-    label,
-    legend_above,
-    new_figure,
-    save,
-    shade,
-    short_name,
-)
 from magtwin.figures.maps import draw_mean
 from magtwin.figures.page import Page, to_html
 from magtwin.figures.reports import page_of_report
@@ -80,7 +68,7 @@ def draw_localization(result: Localization) -> Figure:
     field = _map_of(result)
     x0, x1, y0, y1 = _extent(result, field)
     tall = float(np.clip((WIDTH_IN - 2.2) * (y1 - y0) / (x1 - x0), 2.5, 7.0))
-    figure = new_figure(WIDTH_IN, tall + 5.7)
+    figure = canvas.new_figure(WIDTH_IN, tall + 5.7)
     figure.set_layout_engine("constrained", h_pad=0.1)
     grid = GridSpec(3, 1, figure, height_ratios=[tall + 0.5, 2.3, 1.4])
     top, position, heading = (figure.add_subplot(grid[k]) for k in range(3))
@@ -89,7 +77,7 @@ def draw_localization(result: Localization) -> Figure:
     _draw_position(position, result)
     _draw_heading(heading, result)
     heading.sharex(position)
-    label(heading, "time [s]")
+    canvas.label(heading, "time [s]")
     position.tick_params(labelbottom=False)
     figure.suptitle(_title(result), x=0.01, ha="left")
     return figure
@@ -107,13 +95,13 @@ def page_of_localization(result: Localization) -> Page:
 
     def timed(draw: Callable[[Axes, Localization], None], ax: Axes) -> None:
         draw(ax, result)
-        label(ax, "time [s]")
+        canvas.label(ax, "time [s]")
 
     position, heading = partial(timed, _draw_position), partial(timed, _draw_heading)
     charts = (
-        Chart("The estimated path over the map", floor, tall + 2.0, "path"),
-        Chart("Error of the position, and the bound of any method", position, 3.4, "position"),
-        Chart("Error of the heading, and its bound", heading, 2.6, "heading"),
+        canvas.Chart("The estimated path over the map", floor, tall + 2.0, "path"),
+        canvas.Chart("Error of the position, and the bound of any method", position, 3.4, "position"),
+        canvas.Chart("Error of the heading, and its bound", heading, 2.6, "heading"),
     )
     lead = _title(result).partition("\n")[0]
     return page_of_report(result.report(), "Localization", f"{lead}.", charts)
@@ -143,8 +131,8 @@ def _draw_floor(ax: Axes, result: Localization, field: AnomalyMap | None) -> Non
         draw_mean(ax, field)
     entries: list[Line2D | Patch] = []
 
-    def path(p: Array, name: str, **look: Any) -> None:
-        entries.extend(ax.plot(*p[evenly(len(p), 3000), :2].T, label=name, path_effects=RIM, **look))
+    def path(p: canvas.Array, name: str, **look: Any) -> None:
+        entries.extend(ax.plot(*p[canvas.evenly(len(p), 3000), :2].T, label=name, path_effects=RIM, **look))
 
     if result.dead_reckoning is not None:
         path(result.dead_reckoning.pose, _dead_name(result), zorder=3, **DEAD_LOOK)
@@ -166,11 +154,11 @@ def _draw_floor(ax: Axes, result: Localization, field: AnomalyMap | None) -> Non
     square: dict[str, Any] = {"marker": "s", "ms": 7, "mfc": PAPER, "mec": INK, "ls": "", "zorder": 7}
     entries.extend(ax.plot(*start[0, :2], label="start", **square))
     ax.set_aspect("equal")
-    label(ax, "x [m]", "y [m]")
-    legend_above(ax, 6, handles=entries)
+    canvas.label(ax, "x [m]", "y [m]")
+    canvas.legend_above(ax, 6, handles=entries)
 
 
-def ellipse(p_xy: Array, covariance: Array, sigmas: float = 2.0) -> Array:
+def ellipse(p_xy: canvas.Array, covariance: canvas.Array, sigmas: float = 2.0) -> canvas.Array:
     """Points of the ellipse of a covariance [m^2], shape (2, 2), about p_xy [m]; shape (49, 2)."""
     values, axes = np.linalg.eigh(covariance)
     angle = np.linspace(0, 2 * np.pi, 49)
@@ -194,12 +182,12 @@ def _draw_position(ax: Axes, result: Localization) -> None:
     if np.isfinite(sd).any():
         ax.fill_between(t, floor, np.maximum(sd, floor), label="2 sigma", **BAND_LOOK)
     if dead is not None:
-        draw_line(ax, t, dead, label=_dead_name(result), **DEAD_LOOK)
+        canvas.draw_line(ax, t, dead, label=_dead_name(result), **DEAD_LOOK)
     if error is not None:
-        draw_line(ax, t, error, color=MODEL, label="estimate")
+        canvas.draw_line(ax, t, error, color=MODEL, label="estimate")
     if result.bounds is not None:
-        draw_line(ax, t, result.bounds.correlated, lw=1.8, label="bound, 1 sigma", **BOUND_LOOK)
-    shade(ax, t, track.lost, colour=LOST, name="flagged lost")
+        canvas.draw_line(ax, t, result.bounds.correlated, lw=1.8, label="bound, 1 sigma", **BOUND_LOOK)
+    canvas.shade(ax, t, track.lost, colour=LOST, name="flagged lost")
     most = max(most, float(np.nanmax(dead)) if dead is not None else 0.0)
     if log:
         ax.set_yscale("log")
@@ -208,8 +196,8 @@ def _draw_position(ax: Axes, result: Localization) -> None:
     else:
         ax.set_ylim(0, 1.08 * most)
     ax.set_xlim(t[0], t[-1])
-    label(ax, y="position\nerror [m]")
-    legend_above(ax, 6)
+    canvas.label(ax, y="position\nerror [m]")
+    canvas.legend_above(ax, 6)
 
 
 def _draw_heading(ax: Axes, result: Localization) -> None:
@@ -221,14 +209,14 @@ def _draw_heading(ax: Axes, result: Localization) -> None:
         most = float(np.nanquantile(sd, 0.9))
     if result.truth is not None:
         error = np.degrees(wrap_angle(track.pose[:, 2] - result.truth[:, 2]))
-        draw_line(ax, t, error, color=MODEL)
+        canvas.draw_line(ax, t, error, color=MODEL)
         most = max(most, float(np.nanquantile(np.abs(error), 0.98)))
     if result.bounds is not None:
         for sign in (-1, 1):
-            draw_line(ax, t, sign * np.degrees(result.bounds.heading), lw=1.6, **BOUND_LOOK)
-    shade(ax, t, track.lost, colour=LOST)
+            canvas.draw_line(ax, t, sign * np.degrees(result.bounds.heading), lw=1.6, **BOUND_LOOK)
+    canvas.shade(ax, t, track.lost, colour=LOST)
     ax.set(xlim=(t[0], t[-1]), ylim=(-1.25 * most, 1.25 * most))
-    label(ax, y="heading\nerror [°]")
+    canvas.label(ax, y="heading\nerror [°]")
 
 
 def _dead_name(result: Localization) -> str:
@@ -243,7 +231,8 @@ def _title(result: Localization) -> str:
     seed = f"seed {result.problem.seed}"
     belief = result.problem.belief
     on = "without a map" if belief is None else f"on map {getattr(belief, 'name', '') or 'belief'}"
-    head = f"{short_name(result.method, 40)} {on}, {seed}; run {where or 'recorded'}, {run.duration_s:.0f} s"
+    method, ran = canvas.short_name(result.method, 40), f"run {where or 'recorded'}, {run.duration_s:.0f} s"
+    head = f"{method} {on}, {seed}; {ran}"
     judged = result.truth is not None or not result.read_share
     return "\n".join([head, *(textwrap.wrap(result.report().verdict, TITLE_WIDTH) if judged else ())])
 
@@ -263,7 +252,7 @@ def save_localization(result: Localization, out: str | os.PathLike[str], *, forc
         shown["dead_reckoning"] = None if result.dead_reckoning is None else result.dead_reckoning.pose
         shown["bound_m"] = None if result.bounds is None else result.bounds.correlated
         write_localization(result.run, folder / "localize.rrd", truth=result.truth, **shown)
-        save(draw_localization(result), folder / "localize.png")
+        canvas.save(draw_localization(result), folder / "localize.png")
         (folder / "localize.html").write_text(to_html(page_of_localization(result)), encoding="utf-8")
         _save_tum(folder / "estimate.tum", result.track.t, result.track.pose)
         if result.truth is not None:
@@ -272,7 +261,7 @@ def save_localization(result: Localization, out: str | os.PathLike[str], *, forc
     return Path(out)
 
 
-def _save_tum(path: Path, t: Array, pose: Array) -> None:
+def _save_tum(path: Path, t: canvas.Array, pose: canvas.Array) -> None:
     """Write planar poses as lines `t x y z qx qy qz qw` of the TUM benchmark (Sturm et al. 2012, IROS)."""
     table = np.column_stack([t, pose[:, :2], np.zeros(len(t)), quat_from_yaw(pose[:, 2])])
     header = "# t [s] x y z [m] qx qy qz qw, base_link in world"

@@ -20,21 +20,8 @@ from magtwin.errors import InputError, find
 from magtwin.field.maps.difference import LISTED, MapDifference
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import colour_limits
+from magtwin.figures import style
 from magtwin.figures.canvas import WIDTH_IN, Array, Chart, colour_bar, label, new_figure
-from magtwin.figures.style import (
-    BOUND,
-    FAINT,
-    FIELD_COLOURS,
-    INK,
-    MASKED,
-    PALETTE,
-    PAPER,
-    SIGNED_COLOURS,
-    SLOPE_COLOURS,
-    SOFT,
-    SPREAD_COLOURS,
-    styled,
-)
 from magtwin.frames import rotate
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.scene import Scene
@@ -68,7 +55,7 @@ EXTEND = {(False, False): "neither", (True, True): "both", (True, False): "min",
 """Ends of a colour bar that are pointed, by whether values lie below and above its scale."""
 
 
-@styled
+@style.styled
 def draw_map(
     field: AnomalyMap | Sequence[AnomalyMap],
     *,
@@ -131,7 +118,7 @@ def draw_map(
     if legend:
         figure.legend(legend.values(), legend.keys(), loc="outside lower right", ncols=3)
     if not several:
-        figure.suptitle(_summary(fields[0], 100 if len(panels) > 1 else 46), x=0.01, ha="left")
+        figure.suptitle(_summary(fields[0], 125 if len(panels) > 1 else 46), x=0.01, ha="left")
     return figure
 
 
@@ -156,7 +143,7 @@ def _draw_alone(ax: Axes, panel: "_Panel", scale: "_Scale", plan: "FloorPlan | N
     label(ax, "x [m]", "y [m]")
 
 
-@styled
+@style.styled
 def draw_difference(difference: MapDifference) -> Figure:
     """Draw what changed between two surveys and how certain it is; regions have the numbers of the report."""
     grid, count = difference.grid, np.isfinite(difference.z).sum(axis=0)
@@ -170,13 +157,13 @@ def draw_difference(difference: MapDifference) -> Figure:
         (axes[1], z, "z, of the heading where it is greatest" if several else "z"),
     ):
         reach = max(map(abs, colour_limits(layer, 0))) or 1.0  # all values: the peaks matter here
-        cells = draw_cells(ax, grid.x_m, grid.y_m, layer, SIGNED_COLOURS, vmin=-reach, vmax=reach)
+        cells = draw_cells(ax, grid.x_m, grid.y_m, layer, style.SIGNED_COLOURS, vmin=-reach, vmax=reach)
         colour_bar(figure, cells, ax, title, below=True)
         dx, dy = grid.cell_m
         for number, region in enumerate(difference.regions[:LISTED], 1):
             x0, x1, y0, y1 = np.add(region.extent_m, np.array([-dx, dx, -dy, dy]) / 2)
-            ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, ec=INK, lw=1.2))
-            box = {"boxstyle": "round,pad=0.15", "fc": PAPER, "ec": "none", "alpha": 0.8}
+            ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, ec=style.INK, lw=1.2))
+            box = {"boxstyle": "round,pad=0.15", "fc": style.PAPER, "ec": "none", "alpha": 0.8}
             place: dict[str, Any] = {"textcoords": "offset points", "va": "top"}
             ax.annotate(str(number), (x0, y1), (2, -2), bbox=box, **place)
     names = [" ".join(t for t in pair if t) for pair in zip(difference.names, difference.days, strict=True)]
@@ -189,7 +176,7 @@ def draw_difference(difference: MapDifference) -> Figure:
     ]
     lines = [f"{names[0]} to {names[1]}", *textwrap.wrap(", ".join(words), 100)]
     figure.suptitle("\n".join(lines))
-    legend = {"changed region": Patch(facecolor="none", edgecolor=INK)} if regions else {}
+    legend = {"changed region": Patch(facecolor="none", edgecolor=style.INK)} if regions else {}
     legend |= {} if count.all() else {"not known to both surveys": _hatched()}
     if legend:
         figure.legend(legend.values(), legend.keys(), loc="outside lower right", ncols=2)
@@ -204,8 +191,8 @@ def draw_cells(
     The nodes x_m (X,) and y_m (Y,) are in metres; `look` has further options of `pcolormesh`.
     """
     if np.isnan(layer).any():
-        ax.set_facecolor(MASKED)
-        ax.patch.set(hatch=HATCH, edgecolor=FAINT)
+        ax.set_facecolor(style.MASKED)
+        ax.patch.set(hatch=HATCH, edgecolor=style.FAINT)
     ax.set_aspect("equal")
     look = {"rasterized": True, **look}
     return ax.pcolormesh(x_m, y_m, np.ma.masked_invalid(layer), shading="nearest", cmap=colours, **look)
@@ -220,7 +207,7 @@ def draw_mean(ax: Axes, field: AnomalyMap) -> tuple[float, float]:
     """Draw a map's mean over headings pale, with its bar; returns the ends of the scale [nT]."""
     known = mean_field_nt(field)
     low, high = colour_limits(known)
-    pale = 0.5 * colormaps[FIELD_COLOURS](np.linspace(0, 1, 64)) + 0.5
+    pale = 0.5 * colormaps[style.FIELD_COLOURS](np.linspace(0, 1, 64)) + 0.5
     colours = LinearSegmentedColormap.from_list("pale", np.minimum(pale, 1.0))
     mesh = draw_cells(ax, field.x_m, field.y_m, known, colours, vmin=low, vmax=high)
     colour_bar(ax.figure, mesh, ax, "map, mean over headings [nT]", below=True)
@@ -255,9 +242,9 @@ class FloorPlan:
     def draw(self, ax: Axes) -> None:
         """Draw the outlines, and widen the view to hold them."""
         looks: tuple[tuple[tuple[Array, ...], dict[str, Any]], ...] = (
-            (self.pieces, {"fc": FAINT, "ec": SOFT, "alpha": 0.45, "lw": 0.8}),
-            (self.solids, {"fc": SOFT, "ec": SOFT, "lw": 0.6}),
-            (self.doors, {"fc": "none", "ec": BOUND, "lw": 1.6}),
+            (self.pieces, {"fc": style.FAINT, "ec": style.SOFT, "alpha": 0.45, "lw": 0.8}),
+            (self.solids, {"fc": style.SOFT, "ec": style.SOFT, "lw": 0.6}),
+            (self.doors, {"fc": "none", "ec": style.BOUND, "lw": 1.6}),
         )
         for outlines, look in looks:
             for outline in outlines:
@@ -275,9 +262,9 @@ class FloorPlan:
     def keys(self) -> dict[str, Patch]:
         """Entries of a legend."""
         looks = (
-            ("solid near the floor", self.solids, Patch(fc=SOFT)),
-            ("furniture", self.pieces, Patch(fc=FAINT, ec=SOFT, alpha=0.45)),
-            ("door", self.doors, Patch(fc="none", ec=BOUND)),
+            ("solid near the floor", self.solids, Patch(fc=style.SOFT)),
+            ("furniture", self.pieces, Patch(fc=style.FAINT, ec=style.SOFT, alpha=0.45)),
+            ("door", self.doors, Patch(fc="none", ec=style.BOUND)),
         )
         return {name: patch for name, outlines, patch in looks if outlines}
 
@@ -286,7 +273,7 @@ _ENDS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
 
 def _hatched() -> Patch:
-    return Patch(facecolor=MASKED, hatch=HATCH, edgecolor=FAINT)
+    return Patch(facecolor=style.MASKED, hatch=HATCH, edgecolor=style.FAINT)
 
 
 def _panels(
@@ -341,7 +328,7 @@ class _Quantity:
     label: str
     """Its name and unit."""
 
-    colours: str = FIELD_COLOURS
+    colours: str = style.FIELD_COLOURS
     """Name of its colour scale."""
 
     about_zero: bool = False
@@ -356,15 +343,15 @@ QUANTITIES: Mapping[str, _Quantity] = {
     "gradient": _Quantity(
         lambda field: _slope(_known_nt(field), field),
         "gradient [nT/m]",
-        SLOPE_COLOURS,
+        style.SLOPE_COLOURS,
         unknown="masked, or beside a masked node",
     ),
-    "variance": _Quantity(_sd_nt, "standard deviation [nT]", SPREAD_COLOURS),
+    "variance": _Quantity(_sd_nt, "standard deviation [nT]", style.SPREAD_COLOURS),
     "mask": _Quantity(lambda field: np.where(field.valid, 1.0, np.nan), "holds field"),
     "headings": _Quantity(
         _heading_difference_nt,
         "difference from the mean over headings [nT]",
-        SIGNED_COLOURS,
+        style.SIGNED_COLOURS,
         about_zero=True,
         unknown="masked in some heading",
     ),
@@ -375,7 +362,9 @@ QUANTITIES: Mapping[str, _Quantity] = {
         "plasma",
         unknown="masked in some heading",
     ),
-    "sd": _Quantity(lambda field: np.sqrt(np.mean(_sd_nt(field) ** 2, axis=0))[None], "[nT]", SPREAD_COLOURS),
+    "sd": _Quantity(
+        lambda field: np.sqrt(np.mean(_sd_nt(field) ** 2, axis=0))[None], "[nT]", style.SPREAD_COLOURS
+    ),
 }
 """Quantities of a map that can be drawn, by name."""
 
@@ -398,8 +387,8 @@ class _Panel:
         x, y, layer = self.field.x_m[i], self.field.y_m[j], self.layer[j][:, i]
         keys = {} if plan is None else plan.keys()
         if self.quantity == "mask":
-            drawn = draw_cells(ax, x, y, layer, ListedColormap([PALETTE["teal"][0]]), alpha=0.5)
-            keys["holds field"] = Patch(facecolor=PALETTE["teal"][0], alpha=0.5)
+            drawn = draw_cells(ax, x, y, layer, ListedColormap([style.PALETTE["teal"][0]]), alpha=0.5)
+            keys["holds field"] = Patch(facecolor=style.PALETTE["teal"][0], alpha=0.5)
         else:
             drawn = scale.draw(ax, x, y, layer)
         if plan is not None:

@@ -569,7 +569,8 @@ def add_bar(plotter: Any, colour_map: str, limits: tuple[float, float], title: s
     actor = plotter.add_mesh(points, scalars="field", cmap=table, opacity=0, show_scalar_bar=False)
     letters = max(8, round(min(plotter.window_size[1], plotter.window_size[0] / 1.6) / 42))
     low, high = {"": (0.2, 0.6), "upper": (0.54, 0.36), "lower": (0.06, 0.36)}[half]
-    place = {"vertical": True, "position_x": 0.92, "position_y": low, "height": high, "width": 0.05}
+    left = min(0.92, 0.975 - 3.6 * letters / plotter.window_size[0])  # numbers of a small picture are wide
+    place = {"vertical": True, "position_x": left, "position_y": low, "height": high, "width": 0.05}
     font = {"fmt": "%.0f", "color": INK, "title_font_size": letters, "label_font_size": letters}
     bar = plotter.add_scalar_bar(title=title, mapper=actor.mapper, **place, **font)
     background = pyvista.Color(BACKGROUND).float_rgb

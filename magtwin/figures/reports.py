@@ -14,18 +14,7 @@ from numpy.typing import ArrayLike
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import map_metadata
-from magtwin.figures.canvas import (
-    POINTS,
-    WIDTH_IN,
-    Chart,
-    draw_line,
-    evenly,
-    label,
-    legend_above,
-    new_figure,
-    short_name,
-    stretches,
-)
+from magtwin.figures import canvas
 from magtwin.figures.maps import FloorPlan, map_charts
 from magtwin.figures.page import Page, Section, Table, text_of
 from magtwin.figures.player import player_of
@@ -170,7 +159,11 @@ def _section(named: NamedRun) -> Section:
 
 
 def page_of_report(
-    report: Report, title: str, lead: str = "", charts: Sequence[Chart] = (), tables: Sequence[Table] = ()
+    report: Report,
+    title: str,
+    lead: str = "",
+    charts: Sequence[canvas.Chart] = (),
+    tables: Sequence[Table] = (),
 ) -> Page:
     """A report as a page: its verdict, first figures, charts, and tables, its source folded."""
     shown = list(_numbers(report).items())
@@ -253,8 +246,8 @@ def page_of_check(report: Report) -> Page:
         ax.set_yticks(range(len(order)), order)
         ax.set(ylim=(len(order) - 0.5, -0.5), xlim=(0, None))
         ax.grid(axis="both")
-        label(ax, "error on left-out readings [nT]")
-        legend_above(ax)
+        canvas.label(ax, "error on left-out readings [nT]")
+        canvas.legend_above(ax)
 
     best = order[0]
     verdict = f"{best} predicts left-out readings best: RMSE {value(best, 'RMSE'):,.0f} nT"
@@ -263,7 +256,7 @@ def page_of_check(report: Report) -> Page:
     if value(best, "coverage"):
         verdict += f"; its 90 % intervals hold {value(best, 'coverage'):.0f} % of them"
     title, table = "Errors of each method on readings left out of its fit", Table("Methods", head, rows)
-    charts = (Chart(title, draw, 1.4 + 0.3 * len(order), "errors"),)
+    charts = (canvas.Chart(title, draw, 1.4 + 0.3 * len(order), "errors"),)
     page = page_of_report(replace(report, verdict=f"{verdict}."), report.title, "", charts, (table,))
     figures = [("readings", f"{values['readings predicted'].value:,}")]
     figures += [(f"{name}, RMSE", f"{value(name, 'RMSE'):,.0f} nT") for name in order[:4]]
@@ -320,7 +313,7 @@ def _events(run: Run) -> list[tuple[str, str, int, str]]:
     events = []
     for name, on in run.items():
         if name.startswith("flag_") and on.dtype == bool and on.any():
-            ends = [(run["t"][first], run["t"][after - 1]) for first, after in stretches(on)]
+            ends = [(run["t"][first], run["t"][after - 1]) for first, after in canvas.stretches(on)]
             text = ", ".join(f"{a:.2f}–{b:.2f}" if b > a else f"{a:.2f}" for a, b in ends[:MOST_SPANS])
             text += f" and {len(ends) - MOST_SPANS:,} more" if len(ends) > MOST_SPANS else ""
             events.append((name, COLUMNS[name].doc if name in COLUMNS else "", int(on.sum()), text))
@@ -342,7 +335,7 @@ def draw_comparison(a: NamedRun, b: NamedRun, comparison: Comparison) -> Figure:
     """Draw two runs by their own clocks, and aligned, as `magtwin.run.compare.compare` compared them."""
     charts = _charts(a, b, comparison)
     heights = [chart.height_in for chart in charts]
-    figure = new_figure(9.0, 0.95 * sum(heights))
+    figure = canvas.new_figure(9.0, 0.95 * sum(heights))
     axes = figure.subplots(len(charts), 1, squeeze=False, height_ratios=heights)[:, 0]
     for ax, chart in zip(axes, charts, strict=True):
         chart.draw(ax)
@@ -391,10 +384,10 @@ def section_of_traversals(both: Traversals, names: tuple[str, str]) -> Section:
     return Section(title, "; ".join(runs) + ".", tuple(pictures), (Table(title, head, tuple(rows), note),))
 
 
-def _charts(a: NamedRun, b: NamedRun, comparison: Comparison) -> list[Chart]:
+def _charts(a: NamedRun, b: NamedRun, comparison: Comparison) -> list[canvas.Chart]:
     """The field as recorded and aligned, the distance, and both paths, as far as they are known."""
     column, position = field_name(a.run, b.run), position_name(a.run, b.run)
-    names = tuple(short_name(one.name) for one in (a, b))
+    names = tuple(canvas.short_name(one.name) for one in (a, b))
     names = names if names[0] != names[1] else (f"A: {names[0]}", f"B: {names[1]}")
     along = "distance driven [m]" if comparison.align == "path" else "time [s]"
     looks: Any = ({"color": DATA, "lw": 2.2, "alpha": 0.6}, {"color": MODEL, "lw": 1.1})
@@ -404,20 +397,20 @@ def _charts(a: NamedRun, b: NamedRun, comparison: Comparison) -> list[Chart]:
     ) -> Callable[[Axes], None]:
         def draw(ax: Axes) -> None:
             for (at, values), name, look in zip(curves, names, looks, strict=True):
-                draw_line(ax, at, values, label=name, **look)
+                canvas.draw_line(ax, at, values, label=name, **look)
             ax.margins(x=0)
-            label(ax, x, y)
-            legend_above(ax, 2)
+            canvas.label(ax, x, y)
+            canvas.legend_above(ax, 2)
 
         return draw
 
     def paths(ax: Axes) -> None:
         for run, name, look in zip((a.run, b.run), names, looks, strict=True):
-            ax.plot(*run[str(position)][evenly(run.rows, POINTS), :2].T, label=name, **look)
+            ax.plot(*run[str(position)][canvas.evenly(run.rows, canvas.POINTS), :2].T, label=name, **look)
         ax.set_aspect("equal")
         ax.margins(0.05)
-        label(ax, "x [m]", "y [m]")
-        legend_above(ax, 2)
+        canvas.label(ax, "x [m]", "y [m]")
+        canvas.legend_above(ax, 2)
 
     charts = []
     if column is not None:
@@ -428,16 +421,16 @@ def _charts(a: NamedRun, b: NamedRun, comparison: Comparison) -> list[Chart]:
             title += "" if match.correlation is None else f", correlation {match.correlation:.3f}"
         clocks = [(run["t"] - run["t"][0], run[column]) for run in (a.run, b.run)]
         x, y = "time from the start of each run [s]", f"{column.removesuffix('_nt')} [nT]"
-        charts.append(Chart("as recorded", lines(x, y, *clocks), file="recorded"))
+        charts.append(canvas.Chart("as recorded", lines(x, y, *clocks), file="recorded"))
         values = [(comparison.at, part) for part in comparison.fields[column]]
-        charts.append(Chart(title, lines(along, y, *values), file="aligned"))
+        charts.append(canvas.Chart(title, lines(along, y, *values), file="aligned"))
     if position is not None:
         apart = [(comparison.at, part) for part in (comparison.along_m, comparison.cross_m)]
         draw = lines(along, "distance [m]", *apart, names=("along-track", "cross-track"))
-        charts.append(Chart(f"distance of {names[1]} from {names[0]}", draw, file="distance"))
+        charts.append(canvas.Chart(f"distance of {names[1]} from {names[0]}", draw, file="distance"))
         wide, tall = np.ptp(np.vstack([run[position][:, :2] for run in (a.run, b.run)]), axis=0)
-        height = float(np.clip((WIDTH_IN - 0.8) * tall / max(wide, 1e-9), 1.4, 5.0)) + 1.0
-        charts.append(Chart("paths", paths, height, "paths"))
+        height = float(np.clip((canvas.WIDTH_IN - 0.8) * tall / max(wide, 1e-9), 1.4, 5.0)) + 1.0
+        charts.append(canvas.Chart("paths", paths, height, "paths"))
     return charts
 
 

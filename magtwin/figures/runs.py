@@ -12,34 +12,9 @@ from numpy.typing import ArrayLike
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import colour_limits
-from magtwin.figures.canvas import (
-    POINTS,
-    WIDTH_IN,
-    Array,
-    Picture,
-    colour_bar,
-    coloured_line,
-    draw_line,
-    evenly,
-    label,
-    legend_above,
-    new_figure,
-    picture,
-    shade,
-)
+from magtwin.figures import canvas, style
+from magtwin.figures.canvas import label
 from magtwin.figures.maps import EXTEND, FloorPlan, draw_cells, draw_mean, mean_field_nt
-from magtwin.figures.style import (
-    DATA,
-    FAINT,
-    FIELD_COLOURS,
-    INK,
-    MODEL,
-    OTHER,
-    PAPER,
-    SIGNED_COLOURS,
-    SOFT,
-    styled,
-)
 from magtwin.report.verdict import Z_90
 from magtwin.run import mapped
 from magtwin.run.compare import FIELDS, POSITIONS
@@ -59,12 +34,9 @@ LETTER_IN = 0.085
 DASHES: dict[str, Any] = {"ls": (0, (6, 1.2))}
 
 
-@styled
+@style.styled
 def draw_run(
-    run: Run,
-    field: AnomalyMap | None = None,
-    planned: ArrayLike | None = None,
-    plan: FloorPlan | None = None,
+    run: Run, field: AnomalyMap | None = None, planned: ArrayLike | None = None, plan: FloorPlan | None = None
 ) -> Figure:
     """Draw a run: the path, and against time what the map lacks, what was predicted of it, and the rest.
 
@@ -85,7 +57,7 @@ def draw_run(
         mapped.release()
     place, panels = position_name(run), panels_of(run)
     both = place is not None and bool(panels)
-    figure = new_figure(14.0 if both else 8.0, 8.0 if len(panels) > 3 or not both else 6.0)
+    figure = canvas.new_figure(14.0 if both else 8.0, 8.0 if len(panels) > 3 or not both else 6.0)
     sides = figure.subfigures(1, 1 + both, squeeze=False, width_ratios=(1.1, 1)[: 1 + both])[0]
     if place is not None:
         if not len(_places(run, place)):
@@ -113,11 +85,11 @@ class Panel:
     label: str
     """Name and unit of the quantity."""
 
-    curves: tuple[tuple[str, Array, dict[str, Any]], ...]
+    curves: tuple[tuple[str, canvas.Array, dict[str, Any]], ...]
     """Name, values and look of each curve."""
 
     height: float = 1.0
-    band: tuple[Array, Array] | None = None
+    band: tuple[canvas.Array, canvas.Array] | None = None
     """Middle and half width of the band of 90 % of what is predicted."""
 
     about_zero: bool = False
@@ -127,26 +99,26 @@ class Panel:
         """Draw the curves, with a legend if there are several; shade the time while the LiDAR is on."""
         t = run["t"]
         for name, values, look in self.curves:
-            draw_line(ax, t, values, label=name, **look)
+            canvas.draw_line(ax, t, values, label=name, **look)
         if self.band is not None:
-            rows = evenly(run.rows, POINTS // 2)
+            rows = canvas.evenly(run.rows, canvas.POINTS // 2)
             middle, half = (values[rows] for values in self.band)
-            look = {"color": MODEL, "alpha": 0.22, "lw": 0, "label": "its 90 % band", "zorder": 1.9}
+            look = {"color": style.MODEL, "alpha": 0.22, "lw": 0, "label": "its 90 % band", "zorder": 1.9}
             ax.fill_between(t[rows], middle - half, middle + half, **look)
         if self.about_zero:
-            ax.axhline(0, color=FAINT, lw=0.7, zorder=0)
+            ax.axhline(0, color=style.FAINT, lw=0.7, zorder=0)
         if len(self.curves) > 1 or self.band is not None or self.about_zero:
-            legend_above(ax)
+            canvas.legend_above(ax)
         ax.margins(x=0)
         label(ax, y=self.label)
         if "lidar_on" in run:
-            shade(ax, t, run["lidar_on"])
+            canvas.shade(ax, t, run["lidar_on"])
 
 
 def panels_of(run: Run) -> list[Panel]:
     """The graphs that a run has columns for; of a run with none of the usual ones, its first columns."""
     panels = _residuals(run)
-    grey, data, model = ({"color": ink} for ink in (SOFT, DATA, MODEL))
+    grey, data, model = ({"color": ink} for ink in (style.SOFT, style.DATA, style.MODEL))
     columns = ("b_measured_nt", "b_total_nt", field_name(run))
     read = next((name for name in columns if name and _has(run, name)), "")
     first = "reading" if read == "b_measured_nt" else read
@@ -179,11 +151,11 @@ def _residuals(run: Run) -> list[Panel]:
     """What the map lacks, measured and predicted, and the error of the prediction, each about zero."""
     if not _has(run, "b_map_nt"):
         return []
-    field, grey = run["b_map_nt"], {"color": FAINT}
+    field, grey = run["b_map_nt"], {"color": style.FAINT}
     read = next((name for name in ("b_measured_nt", "b_total_nt") if _has(run, name)), "")
     if not read:
         return []
-    lacks: list[tuple[str, Array, dict[str, Any]]] = [("reading − map", run[read] - field, grey)]
+    lacks: list[tuple[str, canvas.Array, dict[str, Any]]] = [("reading − map", run[read] - field, grey)]
     exact = run["b_truth_nt"] if _has(run, "b_truth_nt") else None
     judge, name = (run[read], "reading") if exact is None else (exact, "exact")
     told = prediction_nt(run) if "b_total_nt" in run else field
@@ -191,12 +163,13 @@ def _residuals(run: Run) -> list[Panel]:
     if not (np.nan_to_num(told - field).any() and np.nan_to_num(error).any()):
         if exact is None:
             return [Panel("what the map\nlacks [nT]", tuple(lacks), 2.0, None, about_zero=True)]
-        lacks.append(("exact − map", exact - field, {"color": DATA}))  # nothing is predicted
-        error, sd, look, title = run[read] - exact, None, {"color": DATA}, "reading − exact"
+        lacks[0][2]["lw"] = 3.0  # nothing is predicted, and the next line covers it
+        lacks.append(("exact − map", exact - field, {"color": style.DATA}))
+        error, sd, look, title = run[read] - exact, None, {"color": style.DATA}, "reading − exact"
     else:
-        lacks.append(("predicted", told - field, {"color": MODEL, "lw": 1.6}))
+        lacks.append(("predicted", told - field, {"color": style.MODEL, "lw": 1.0}))
         sd = Z_90 * run["b_sd_nt"] if _has(run, "b_sd_nt") else None
-        look, title = {"color": MODEL}, f"prediction − {name}"
+        look, title = {"color": style.MODEL}, f"prediction − {name}"
     title += f": mean size {np.nanmean(np.abs(error)):,.0f} nT" if np.isfinite(error).any() else ""
     middle = None if sd is None else (told - field, sd), None if sd is None else (0 * sd, sd)
     return [
@@ -209,7 +182,7 @@ def _residuals(run: Run) -> list[Panel]:
 class Trail:
     """What colours a path: the reading less the map, about zero; or the reading if no map is known."""
 
-    values: Array
+    values: canvas.Array
     """Values [nT], shape (N,), nan where unknown."""
 
     name: str
@@ -223,11 +196,11 @@ class Trail:
         values = run[column] if column else np.full(run.rows, np.nan)
         if column in (None, "b_map_nt") or not _has(run, "b_map_nt"):
             name = f"{(column or '').removesuffix('_nt')} [nT]" if column else ""
-            return cls(values, name, limits or colour_limits(values, 0), FIELD_COLOURS)
+            return cls(values, name, limits or colour_limits(values, 0), style.FIELD_COLOURS)
         values = values - run["b_map_nt"]
         size = np.abs(values[np.isfinite(values)])
         reach = float(np.quantile(size, TRAIL_SHARE)) if len(size) else 0.0
-        return cls(values, "reading − map [nT]", (-reach or -1.0, reach or 1.0), SIGNED_COLOURS)
+        return cls(values, "reading − map [nT]", (-reach or -1.0, reach or 1.0), style.SIGNED_COLOURS)
 
 
 def draw_path(
@@ -248,22 +221,22 @@ def draw_path(
         plan.draw(ax)
     elif field is None:
         ax.margins(0.08)
-    for ink, width in ((INK, 6.0), (PAPER, 5.0)):  # one of the two edges differs from the map
-        ax.plot(*p_xy[evenly(len(p_xy), 3000)].T, color=ink, lw=width, solid_capstyle="round")
-    line = coloured_line(ax, p_xy, trail.values[known], trail.limits, trail.colours, 3.4)
+    for ink, width in ((style.INK, 6.0), (style.PAPER, 5.0)):  # one of the two edges differs from the map
+        ax.plot(*p_xy[canvas.evenly(len(p_xy), 3000)].T, color=ink, lw=width, solid_capstyle="round")
+    line = canvas.coloured_line(ax, p_xy, trail.values[known], trail.limits, trail.colours, 3.4)
     if planned is not None:
         points = np.asarray(planned, float)[:, :2]
-        ax.plot(*points.T, color=OTHER, lw=1.0, ls=(0, (4, 3)), zorder=4, label="planned")
-    ax.plot(*p_xy[0], marker="o", ms=7, mfc=PAPER, mec=INK, ls="", zorder=5, label="start")
-    if trail.name and (field is None or trail.colours == SIGNED_COLOURS):
+        ax.plot(*points.T, color=style.OTHER, lw=1.0, ls=(0, (4, 3)), zorder=4, label="planned")
+    ax.plot(*p_xy[0], marker="o", ms=7, mfc=style.PAPER, mec=style.INK, ls="", zorder=5, label="start")
+    if trail.name and (field is None or trail.colours == style.SIGNED_COLOURS):
         finite = trail.values[np.isfinite(trail.values)]
         ends = bool((finite < trail.limits[0]).any()), bool((finite > trail.limits[1]).any())
-        colour_bar(ax.figure, line, ax, trail.name, below=True, extend=EXTEND[ends])
+        canvas.colour_bar(ax.figure, line, ax, trail.name, below=True, extend=EXTEND[ends])
     ax.set_aspect("equal")
     label(ax, "x [m]", "y [m]")
     handles, names = ax.get_legend_handles_labels()
     keys = {} if plan is None else plan.keys()
-    legend_above(ax, 5, handles=[*handles, *keys.values()], labels=[*names, *keys])
+    canvas.legend_above(ax, 5, handles=[*handles, *keys.values()], labels=[*names, *keys])
 
 
 def field_name(*runs: Run) -> str | None:
@@ -276,7 +249,7 @@ def position_name(*runs: Run) -> str | None:
     return next((name for name in POSITIONS if all(_has(run, name) for run in runs)), None)
 
 
-def _places(run: Run, column: str) -> Array:
+def _places(run: Run, column: str) -> canvas.Array:
     """The known positions of a column along x and y [m], shape (N, 2)."""
     return run[column][np.isfinite(run[column][:, :2]).all(axis=1), :2]
 
@@ -285,28 +258,26 @@ def _has(run: Run, *names: str) -> bool:
     return all(name in run and np.isfinite(run[name]).any() for name in names)
 
 
-@styled
-def path_picture(
-    run: Run,
-    field: AnomalyMap | None,
-    planned: ArrayLike | None,
-) -> Picture | None:
+@style.styled
+def path_picture(run: Run, field: AnomalyMap | None, planned: ArrayLike | None) -> canvas.Picture | None:
     """The path of a run over its map, or over a bare floor; None if its places or readings are unknown."""
     position, column = position_name(run), field_name(run)
     if position is None or column is None or len(_places(run, position)) < 2:
         return None
     p_xy = _places(run, position)
     wide, tall = np.ptp(p_xy, axis=0) if field is None else np.ptp(np.reshape(field.extent, (2, 2)), axis=1)
-    height = float(np.clip((WIDTH_IN - 0.8) * tall / max(wide, 1e-9), 1.5, 6.0))
-    figure = new_figure(WIDTH_IN, height + (1.9 if field is not None else 1.2))
+    height = float(np.clip((canvas.WIDTH_IN - 0.8) * tall / max(wide, 1e-9), 1.5, 6.0))
+    figure = canvas.new_figure(canvas.WIDTH_IN, height + (1.9 if field is not None else 1.2))
     draw_path(figure.subplots(), run, position, field, planned)
     over = "the path" if field is None else f"the path over the map {field.name}"
     what = Trail.of(run).name.removesuffix(" [nT]")
-    return picture(figure, f"Path driven, coloured by {what}", alt=f"{over}, coloured by {what}", kind="png")
+    return canvas.picture(
+        figure, f"Path driven, coloured by {what}", alt=f"{over}, coloured by {what}", kind="png"
+    )
 
 
-@styled
-def still_of(run: Run | None, field: AnomalyMap | None) -> Picture | None:
+@style.styled
+def still_of(run: Run | None, field: AnomalyMap | None) -> canvas.Picture | None:
     """A small picture without axes: the path of a run over its map, coloured as by `draw_path`.
 
     None if neither the map nor a path is known. Without a run, the map alone.
@@ -318,20 +289,20 @@ def still_of(run: Run | None, field: AnomalyMap | None) -> Picture | None:
         return None
     low, high = np.reshape(field.extent, (2, 2)).T if field else (p_xy.min(axis=0), p_xy.max(axis=0))
     wide, tall = np.maximum(high - low, 0.1)
-    figure = new_figure(2.0, float(np.clip(2.0 * tall / wide, 0.8, 2.4)))
+    figure = canvas.new_figure(2.0, float(np.clip(2.0 * tall / wide, 0.8, 2.4)))
     figure.set_layout_engine("none")
     ax = figure.add_axes((0, 0, 1, 1))
     if field is not None:
         mean = mean_field_nt(field)
-        draw_cells(ax, field.x_m, field.y_m, mean, FIELD_COLOURS, clim=colour_limits(mean))
+        draw_cells(ax, field.x_m, field.y_m, mean, style.FIELD_COLOURS, clim=colour_limits(mean))
     if run is not None and len(p_xy) > 1:
         trail = Trail.of(run)
-        ax.plot(*p_xy[evenly(len(p_xy), 1000)].T, color=INK, lw=3.2)
-        if trail.colours == SIGNED_COLOURS:
-            coloured_line(ax, p_xy, trail.values[known], trail.limits, trail.colours, 2)
+        ax.plot(*p_xy[canvas.evenly(len(p_xy), 1000)].T, color=style.INK, lw=3.2)
+        if trail.colours == style.SIGNED_COLOURS:
+            canvas.coloured_line(ax, p_xy, trail.values[known], trail.limits, trail.colours, 2)
     ax.set_aspect("equal")
     ax.axis("off")
-    return picture(figure, "The map" if len(p_xy) < 2 else "The path over the map", kind="png")
+    return canvas.picture(figure, "The map" if len(p_xy) < 2 else "The path over the map", kind="png")
 
 
 def _title(run: Run, place: str | None) -> str:

@@ -12,27 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
-from magtwin.figures.pictures import (
-    BACKGROUND,
-    INK,
-    LAB_ELEVATION_DEG,
-    Camera,
-    Cutaway,
-    add_bar,
-    add_still,
-    aim,
-    check_png,
-    check_size,
-    inside,
-    is_subject,
-    joined,
-    light,
-    mesh_of,
-    plotter_of,
-    room_above,
-    style_of,
-    write_png,
-)
+from magtwin.figures import pictures
 from magtwin.figures.runs import Trail
 from magtwin.files.outputs import output
 from magtwin.frames import matrix_from_quat, quat_from_yaw
@@ -69,8 +49,8 @@ TRAIL_SPAN_M = 6.0
 UNKNOWN = (150, 150, 150)
 """Colour of the trail where the field is unknown."""
 
-LABEL: Any = {"position": (0.02, 0.93), "viewport": True, "color": INK}
-"""Place and colour of the line of text at the upper left."""
+LABEL: Any = {"position": (0.02, 0.965), "viewport": True, "color": pictures.INK}
+"""Place of the top and colour of the line of text at the upper left."""
 
 SAMPLES = 4
 """Samples per pixel in frames of a film."""
@@ -111,22 +91,24 @@ class View:
             raise InputError(said, parameter="camera")
         return cls("fixed", (x, y, z), (tx, ty, tz))
 
-    def camera(self, seen_s: float = 0.0) -> Camera:
+    def camera(self, seen_s: float = 0.0) -> pictures.Camera:
         """The camera over a lab, `seen_s` [s] into the film."""
         if self.kind == "top":
-            return Camera(azimuth_deg=-90.0, elevation_deg=90.0)
+            return pictures.Camera(azimuth_deg=-90.0, elevation_deg=90.0)
         if self.kind == "fixed":
-            return Camera.between(self.place, self.target)
+            return pictures.Camera.between(self.place, self.target)
         if self.kind == "chase":
             raise InputError("the camera chase is for a run; a stage has none", parameter="camera")
-        return Camera(azimuth_deg=40.0 + ORBIT_DEG_S * seen_s, elevation_deg=LAB_ELEVATION_DEG)
+        return pictures.Camera(
+            azimuth_deg=40.0 + ORBIT_DEG_S * seen_s, elevation_deg=pictures.LAB_ELEVATION_DEG
+        )
 
     @staticmethod
-    def behind(p: Array, q_xyzw: ArrayLike) -> Camera:
+    def behind(p: Array, q_xyzw: ArrayLike) -> pictures.Camera:
         """The chase camera of a robot at p [m], shape (3,)."""
         forward = matrix_from_quat(q_xyzw)[:, 0] * (1, 1, 0)
         place, target = p - BEHIND_M * forward + (0, 0, ABOVE_M), p + AHEAD_M * forward
-        return Camera.between(place, target, 50.0)
+        return pictures.Camera.between(place, target, 50.0)
 
 
 KINDS = ("orbit", "top", "chase")
@@ -160,7 +142,7 @@ class Scenery:
             InputError: A column is missing, a time lies outside the run, the stage shows nothing or has no
                 robot, or the machine has no OpenGL.
         """
-        check_size(size)
+        pictures.check_size(size)
         self._times, self._speed, self._view, self._size = np.asarray(times, float), speed, view, size
         known = (n for n in POSITIONS if n in run and np.isfinite(run[n]).all(axis=1).any())
         self._position = next(known, "")
@@ -174,7 +156,7 @@ class Scenery:
         self._sides = sides_of(scene, run)
         if not shapes:
             raise InputError(f"{scene_file}: shows nothing")
-        self.plotter = plotter_of(size)
+        self.plotter = pictures.plotter_of(size)
         try:
             scale = read_colour_scale(stage)
             still = [s for s in shapes if s.link not in moving]
@@ -182,17 +164,20 @@ class Scenery:
             self._links, self._actors = dict[str, Link](), dict[str, Any]()
             for name, link in moving.items():
                 own = (s for s in shapes if s.link == name and s.vertex_colours is None)
-                if meshes := [mesh_of(s, s.vertices) for s in own]:
+                if meshes := [pictures.mesh_of(s, s.vertices) for s in own]:
                     self._links[name] = link
-                    self._actors[name] = self.plotter.add_mesh(joined(meshes), **style_of(False))
+                    self._actors[name] = self.plotter.add_mesh(
+                        pictures.joined(meshes), **pictures.style_of(False)
+                    )
             self._build_trail(run, scale)
-            light(self.plotter, self._everything, soft=fine)
+            pictures.light(self.plotter, self._everything, soft=fine)
             if not fine:
                 self.plotter.disable_anti_aliasing()
                 self.plotter.enable_anti_aliasing("msaa", multi_samples=SAMPLES)
             self._label = self.plotter.add_text(" ", font_size=max(8, round(size[1] / 60)), **LABEL)
-            self._label.prop.background_color, self._label.prop.background_opacity = BACKGROUND, 0.7
-            self._cutaway = Cutaway(self.plotter, size, self._screens, list(self._actors.values()))
+            self._label.prop.SetVerticalJustificationToTop()
+            self._label.prop.background_color, self._label.prop.background_opacity = pictures.BACKGROUND, 0.7
+            self._cutaway = pictures.Cutaway(self.plotter, size, self._screens, list(self._actors.values()))
         except BaseException:
             self.close()
             raise
@@ -267,10 +252,10 @@ class Scenery:
     ) -> None:
         """Build the lab, one body per look."""
         standing = [placed(s.vertices, links[s.link]) if s.link else s.vertices.astype(float) for s in still]
-        self._subjects = [v for s, v in zip(still, standing, strict=True) if is_subject(s, scale)]
-        drawn = add_still(self.plotter, still, standing, scale, baked=baked)
+        self._subjects = [v for s, v in zip(still, standing, strict=True) if pictures.is_subject(s, scale)]
+        drawn = pictures.add_still(self.plotter, still, standing, scale, baked=baked)
         self._screens, self._walls, self._points = drawn
-        self._things = inside(still, standing)
+        self._things = pictures.inside(still, standing)
         self._everything = np.vstack([*standing, self._p]).astype(float)
 
     def _build_trail(self, run: Run, scale: ColourScale | None) -> None:
@@ -280,7 +265,7 @@ class Scenery:
 
         p_xy = run[self._position][:, :2]
         rows = _steps(p_xy)
-        box = room_above(np.column_stack([p_xy[rows], np.zeros(len(rows))]))
+        box = pictures.room_above(np.column_stack([p_xy[rows], np.zeros(len(rows))]))
         low, high = box.min(axis=0) - NEAR_M, box.max(axis=0) + NEAR_M
         reach = [(v, (v.max(axis=0) > low) & (v.min(axis=0) < high)) for v in self._things]
         near = [v for v, overlaps in reach if overlaps[:2].all()]
@@ -300,9 +285,9 @@ class Scenery:
             share = (trail.values[rows][known] - low) / max(high - low, 1e-9)
             colours[known] = (255 * colormaps[trail.colours](share)[:, :3]).round().astype(np.uint8)
             two, title = limits not in (None, trail.limits), trail.name.replace(" − ", "\n− ")
-            add_bar(self.plotter, trail.colours, trail.limits, title, "lower" * two)
+            pictures.add_bar(self.plotter, trail.colours, trail.limits, title, "lower" * two)
             if scale is not None and limits is not None and two:
-                add_bar(self.plotter, scale.name, limits, f"map [{scale.unit}]", "upper")
+                pictures.add_bar(self.plotter, scale.name, limits, f"map [{scale.unit}]", "upper")
         along = np.gradient(p_xy[rows], axis=0)
         along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
         left = np.column_stack([-along[:, 1], along[:, 0]])
@@ -325,7 +310,7 @@ class Scenery:
             camera = self._view.camera((self._times[k] - self._times[0]) / self._speed)
         if self._view.kind == "top":  # with the whole map, like a picture of the stage
             around = np.vstack([around, *self._subjects])
-        aim(self.plotter, camera, around, self._size, bar=self._bar)
+        pictures.aim(self.plotter, camera, around, self._size, bar=self._bar)
         self._walls.cut(self.plotter.camera.position, np.vstack([self._points, self._p[k] + _ABOVE]))
 
 
@@ -346,7 +331,7 @@ def picture_of_run(
     Raises:
         InputError: As for `Scenery`; or `out` is not a PNG or exists.
     """
-    out, view = check_png(out), View.of(camera)
+    out, view = pictures.check_png(out), View.of(camera)
     if not run.rows or "t" not in run:
         raise InputError("the run has no readings, so there is nothing to show")
     t = float(run["t"][-1]) if time_s is None else time_s
@@ -357,7 +342,7 @@ def picture_of_run(
         output(out, force=force) as aside,
         Scenery(run, scene_file, [t], view=view, size=size, fine=True) as scenery,
     ):
-        write_png(scenery.frame(0), aside)
+        pictures.write_png(scenery.frame(0), aside)
     return out
 
 

@@ -230,7 +230,7 @@ def output(
         prefix = f".{place.name[:60]}{HIDDEN}"  # the whole name could be too long for the disk
         aside = _Aside(place, Path(tempfile.mkdtemp(prefix=prefix, dir=place.parent)), force)
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+        raise InputError(f"{path}: cannot be written ({error.strerror}); give a name elsewhere") from error
     waits = False
     try:
         yield aside.new
@@ -253,7 +253,9 @@ def output(
         raise InputError(text, parameter=error.parameter) from error
     except Exception as error:  # libraries have errors of their own for a full disk
         if reason := why_full(aside.folder, error):
-            raise InputError(f"{path}: cannot be written ({reason})") from error
+            raise InputError(
+                f"{path}: cannot be written ({reason}); make room there, or give a name elsewhere"
+            ) from error
         raise
     finally:
         if not waits:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from magtwin.errors import InputError
-from magtwin.parallel.pool import C, Failure, Limit, Outcome, R, WorkerError
+from magtwin.parallel.pool import C, Failure, Outcome, R, WorkerError
 from magtwin.parallel.processes import Processes
 from magtwin.version import __version__
 
@@ -81,10 +81,10 @@ class Cluster:
         work: Callable[[C], R],
         chunks: Sequence[C],
         *,
-        limit_s: Limit = None,
+        limit_s: float | None = None,
         progress: Callable[[int, int], Any] | None = None,
     ) -> Iterator[Outcome[R]]:
-        """As `Pool.run`; the limit of a chunk is what `limit_s` gives when the chunk is sent."""
+        """As `Pool.run`."""
         from distributed import as_completed
 
         say = progress or (lambda done, total: None)
@@ -97,9 +97,8 @@ class Cluster:
             futures = []
             for index in islice(waiting, max(0, 2 * sum(client.nthreads().values()) + 2 - len(sent))):
                 chunk = pickle.dumps(chunks[index], pickle.HIGHEST_PROTOCOL)
-                limit = limit_s(chunks[index]) if callable(limit_s) else limit_s
                 future = client.submit(
-                    _lend, pickled, chunk, index, limit, self._session, _version(), pure=False
+                    _lend, pickled, chunk, index, limit_s, self._session, _version(), pure=False
                 )
                 sent[future.key] = index, future
                 futures.append(future)
@@ -180,7 +179,7 @@ def _lend(
         pool = Processes(1, idle_s=IDLE_S)
     _used.append((session, pool))
     try:
-        (outcome,) = pool.run_pickled(work, 1, lambda k: chunk, lambda k: limit_s, lambda done, total: None)
+        (outcome,) = pool.run_pickled(work, 1, lambda k: chunk, limit_s, lambda done, total: None)
         _lent.append(pool)
     except BaseException:
         pool.close()

@@ -12,9 +12,6 @@ R = TypeVar("R")
 RETRIES = 2
 """How often a chunk is tried again after its worker was killed or crashed."""
 
-Limit = float | Callable[[Any], float] | None
-"""Longest time of a chunk, or between two of its beats [s]; or a function that gives it for a chunk."""
-
 
 @dataclass(frozen=True)
 class Failure:
@@ -76,7 +73,7 @@ class Pool(Protocol):
         work: Callable[[C], R],
         chunks: Sequence[C],
         *,
-        limit_s: Limit = None,
+        limit_s: float | None = None,
         progress: Callable[[int, int], Any] | None = None,
     ) -> Iterator[Outcome[R]]:
         """Call a function for every chunk; gives the outcomes in any order.
@@ -84,8 +81,7 @@ class Pool(Protocol):
         Args:
             work: A pure function that can be pickled.
             chunks: What it is called with, one at a time.
-            limit_s: Longest time of a chunk [s]. A function of a chunk is asked again and again, so that it
-                can follow the times seen so far. Default: no limit.
+            limit_s: Longest time of a chunk, or between two of its beats [s]. Default: no limit.
             progress: Called with the chunks done and all chunks.
 
         Raises:

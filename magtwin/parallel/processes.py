@@ -15,7 +15,7 @@ from typing import Any, Self
 
 from magtwin.errors import InputError
 from magtwin.parallel.machine import end_group, free_memory, processors, variables
-from magtwin.parallel.pool import RETRIES, C, Failure, Limit, Outcome, R, WorkerError
+from magtwin.parallel.pool import RETRIES, C, Failure, Outcome, R, WorkerError
 from magtwin.parallel.worker import serve
 
 STARTS = 3
@@ -142,7 +142,7 @@ class Processes:
         work: Callable[[C], R],
         chunks: Sequence[C],
         *,
-        limit_s: Limit = None,
+        limit_s: float | None = None,
         progress: Callable[[int, int], Any] | None = None,
     ) -> Iterator[Outcome[R]]:
         """As `Pool.run`."""
@@ -150,7 +150,7 @@ class Processes:
             pickle.dumps(work, pickle.HIGHEST_PROTOCOL),
             len(chunks),
             lambda index: pickle.dumps(chunks[index], pickle.HIGHEST_PROTOCOL),
-            lambda index: limit_s(chunks[index]) if callable(limit_s) else limit_s,
+            limit_s,
             progress or (lambda done, total: None),
         )
 
@@ -159,10 +159,10 @@ class Processes:
         work: bytes,
         count: int,
         chunk: Callable[[int], bytes],
-        limit_s: Callable[[int], float | None],
+        limit_s: float | None,
         progress: Callable[[int, int], Any],
     ) -> Iterator[Outcome[Any]]:
-        """As `run` for a pickled function; `chunk` and `limit_s` give pickled chunks and limits by number."""
+        """As `run` for a pickled function; `chunk` gives pickled chunks by number."""
         _check_memory(min(self.jobs, count))
         waiting, tries, done = deque(range(count)), [0] * count, 0
         progress(0, count)
@@ -198,14 +198,13 @@ class Processes:
         for _ in range(min(self.jobs - len(self._workers), len(waiting) - starting)):
             self._workers.append(_Worker(self._idle_s))
 
-    def _outcomes(self, limit_s: Callable[[int], float | None]) -> list[Outcome[Any]]:
+    def _outcomes(self, limit_s: float | None) -> list[Outcome[Any]]:
         """Wait until a worker has something to say or a limit has passed; gives the outcomes of chunks."""
         outcomes: list[Outcome[Any]] = []
         ends: dict[int, float] = {}
         for worker in self._workers:
-            limit = None if worker.chunk is None else limit_s(worker.chunk)
-            if limit is not None:
-                ends[id(worker)] = worker.since + limit * worker.times
+            if worker.chunk is not None and limit_s is not None:
+                ends[id(worker)] = worker.since + limit_s * worker.times
         left = min(ends.values(), default=math.inf) - time.monotonic()
         ready = set(wait([w.connection for w in self._workers], None if left == math.inf else max(0.0, left)))
         for worker in list(self._workers):

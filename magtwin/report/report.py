@@ -8,8 +8,9 @@ from typing import Any
 
 from magtwin.report.summary import LINES, Summarized, Summary
 
-_NUMBERS = re.compile(r"-?\d+(\.\d+)?(, -?\d+(\.\d+)?)+")
-"""A text of several numbers, such as the place of a sensor."""
+_NUMBER = r"[+-]?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?:e[+-]?\d+)?"
+_NUMBERS = re.compile(rf"\(?(?:x )?{_NUMBER}(?:(?:, [xyz ]*| x | to | of |\.\.| ){_NUMBER})*\)?")
+"""A text of numbers, such as a place or a range."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +51,9 @@ class Report(Summarized):
                 figures[key(f"{f.name.removesuffix('_nt')} sd", f.unit)] = f.spread
             notes |= {name: f.note} if f.note else {}
         facts = {key(name): value for name, value in self.metadata.items()}
-        content = {"title": self.title} | ({"verdict": self.verdict} if self.verdict else {})
-        return json.dumps(
-            jsonable(content | {"figures": figures, "notes": notes, "metadata": facts}), indent=2
-        )
+        content: dict[str, Any] = {"title": self.title} | ({"verdict": self.verdict} if self.verdict else {})
+        content |= {"figures": figures, "notes": notes, "metadata": facts}
+        return json.dumps(jsonable(content), indent=2)
 
     def _summary(self) -> Summary:
         """The figures; a notebook also shows the metadata."""
@@ -75,22 +75,21 @@ def key(name: str, unit: str = "") -> str:
     return words if f"_{words}".endswith(f"_{ending}") or not ending else f"{words}_{ending}"
 
 
-def jsonable(content: Any) -> Any:
-    """Content that JSON has: null for numbers that are not finite, lists for texts of numbers and commas."""
+def jsonable(content: Any, name: str = "") -> Any:
+    """Content that JSON has: null for numbers that are not finite, and numbers for texts of numbers."""
     if isinstance(content, dict):
-        return {str(name): jsonable(value) for name, value in content.items()}
+        return {str(key): jsonable(value, str(key)) for key, value in content.items()}
     if isinstance(content, list | tuple):
         return [jsonable(value) for value in content]
     if isinstance(content, float) and not math.isfinite(content):
         return None
     if isinstance(content, str) and _NUMBERS.fullmatch(content):
-        return [float(number) for number in content.split(", ")]
-    return content if content is None or isinstance(content, str | int | float) else _plain(content)
-
-
-def _plain(content: Any) -> Any:
-    """A numpy number or array, or another object as text."""
-    return jsonable(content.tolist()) if hasattr(content, "tolist") else str(content)
+        found = [float(number.replace(",", "")) for number in re.findall(_NUMBER, content)]
+        one = found[0] if re.search("_([msva]|nt|hz|deg|rad|kg)$", name) else content
+        return found if len(found) > 1 else one
+    if hasattr(content, "tolist"):  # a numpy number or array
+        return jsonable(content.tolist())
+    return content if content is None or isinstance(content, str | int | float) else str(content)
 
 
 def _text(figure: Figure) -> str:

@@ -28,15 +28,15 @@ def survey(folder):
 
 def test_a_survey_becomes_a_map_that_info_and_plot_show(tmp_path, capsys):
     folder = survey(tmp_path / "survey")
-    layer, picture = tmp_path / "small.usdc", tmp_path / "small.png"
+    layer, picture = tmp_path / "maps" / "small.usdc", tmp_path / "small.png"
     main(["map", "import", str(folder), "--out", str(layer), "--licence", "CC0-1.0"])
-    main(["plot", str(layer), "--out", str(picture)])
+    main(["plot", str(layer.parent), "--out", str(picture)])
     assert picture.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     capsys.readouterr()
     main(["map", "info", str(layer), "--json"])
     assert "CC0-1.0" in capsys.readouterr().out
     main(["map", "import", str(folder), "--out", str(layer)])
-    assert f"{layer} exists: wrote {tmp_path / 'small-1.usdc'}" in capsys.readouterr().out
+    assert capsys.readouterr().out.startswith(f"{layer} exists: wrote {layer.with_name('small-1.usdc')}; --f")
     main(["map", "import", str(folder), "--out", str(layer), "--force"])
 
 

@@ -35,11 +35,11 @@ SHOWN = (
     "validate IN/room/room.usda --against core --out found.json",
     "bench compare IN/results IN/results",
     "doctor",
-    "completion bash",
+    *("info lab", "info IN/run.parquet", "map info lab", "dataset info IN/set", "completion bash"),
 )
 """Other commands."""
 
-WHOLE = ("completion bash",)
+WHOLE = ("completion bash", *(words for words in SHOWN if "info" in words))
 
 DATA = {
     "compare": "agreements",
@@ -75,6 +75,19 @@ def keys(content, *, by_name=False):
         yield from keys(value, by_name=by_name)
 
 
+NUMBERS = r"\(?(x )?-?\d[\d,]*(\.\d+)?(([ ,.xyz]|to|of)+-?\d[\d,]*(\.\d+)?)*\)?"  # 10 x 7, (1, 2), 25,000
+
+
+def for_eyes(content, name=""):
+    """Texts of numbers in JSON, by their keys, but for dates and versions; notes are for people."""
+    if isinstance(content, dict | list):
+        for key, value in content.items() if isinstance(content, dict) else ((name, x) for x in content):
+            if key not in ("notes", "wrote", "next", "packages", "version", "magtwin", "created", "numpy"):
+                yield from for_eyes(value, key)
+    elif isinstance(content, str) and re.fullmatch(rf"(?!\d+\.\d+\.\d+$)({NUMBERS})", content):
+        yield f"{name}: {content}"
+
+
 def typed(words, capsys):
     """Stdout and stderr of a command that ends well, or finds something."""
     capsys.readouterr()
@@ -103,6 +116,7 @@ def test_a_command_prints_few_lines_and_typed_again_it_writes_beside_and_says_so
     out, told = typed([*words, "--json"], capsys)
     content = json.loads(out, parse_constant=lambda text: pytest.fail(f"{text} is no JSON"))
     assert all(re.fullmatch(r"[a-z][a-z0-9_]*", found) for found in keys(content)), [*keys(content)]
+    assert not [*for_eyes(content)]
     if known := DATA.get(name, DATA.get(words[0], "")):
         assert known in [*keys(content)]
         assert f"`{known}`" in (ROOT / "docs" / "output.md").read_text(encoding="utf-8")

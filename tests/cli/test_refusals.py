@@ -40,7 +40,7 @@ REFUSALS = [
     ("scene lab --out ../here --force", "working folder"),
     ("scene lab --out page.html --force", "is a file"),
     ("plot map.usdc --out taken.png --force", "is a folder"),
-    ("map fit gone.csv --out new.csv", "a map layer ends in .usdc or .usd"),
+    ("map fit gone.csv --out new.csv", "new.csv: a map layer ends in .usdc or .usd or .usda"),
     ("train drives --out new.safetensors", "build one"),
     # what is in files
     ("run empty.toml", "empty"),

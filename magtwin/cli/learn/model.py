@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from cyclopts import App, Parameter
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Flag, Force, Licence, reads_recordings
+from magtwin.cli.options import Flag, Force, Licence, TrainedMap, Weights, reads_recordings
 from magtwin.cli.terminal import Done, named, step
 
 model_app = App(name="model", help="Convert, export and calibrate networks; compensate the platform's field.")
@@ -14,15 +14,13 @@ app.command(model_app)
 
 
 @model_app.command
-def convert(pth: Path, *, out: Path, licence: Licence = "", force: Force = False) -> Done:
+def convert(pth: Path, *, out: Weights, licence: Licence = "", force: Force = False) -> Done:
     """Convert a released checkpoint (.pth) to safetensors, without executing its content.
 
     Parameters
     ----------
     pth
         Checkpoint with the weights and the two scalers.
-    out
-        File to write, .safetensors.
     licence
         Licence of the weights, an SPDX identifier such as MIT, kept in their metadata.
     """
@@ -62,7 +60,7 @@ def widen(
     weights: Path,
     *,
     runs: Annotated[list[Path], Parameter(consume_multiple=True)],
-    map: Path,  # noqa: A002
+    map: TrainedMap,  # noqa: A002
     out: Path,
     force: Force = False,
 ) -> Done:
@@ -77,8 +75,6 @@ def widen(
         Weights of any kind but mixed, which learns this in its training.
     runs
         Recordings of at least 4 other robots, or of plants (`magtwin sweep --plant all:1`).
-    map
-        Map that the weights were trained on: a layer or stage, or a folder of survey CSVs.
     out
         File to write, .safetensors. A model card beside the weights is carried over.
     """
@@ -96,8 +92,8 @@ def calibrate(
     weights: Path,
     run: Path,
     *,
-    map: Path,  # noqa: A002
-    out: Path,
+    map: TrainedMap,  # noqa: A002
+    out: Weights,
     duration_s: float | None = None,
     pose_sd_m: float = 0.0,
     pose_from_map: Flag = False,
@@ -114,10 +110,6 @@ def calibrate(
         Weights of a mixed model, .safetensors (`magtwin train --model mixed`).
     run
         The drive, of any kind that `magtwin dataset build` reads.
-    map
-        Map that the weights were trained on: a layer or stage, or a folder of survey CSVs.
-    out
-        Weights to write, .safetensors.
     duration_s
         Length of the part to use, from the start [s]. Default: all.
     pose_sd_m

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from magtwin.cli.app import app
-from magtwin.cli.options import Force, Names, Whole
+from magtwin.cli.options import Force, Names, Weights, Whole
 from magtwin.cli.terminal import Done, named, progress
 from magtwin.errors import InputError
 from magtwin.files.kinds import SWEEP, kind_of
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def train(
     dataset: Path,
     *,
-    out: Path,
+    out: Weights,
     config: Path | None = None,
     model: str | None = None,
     features: str | None = None,
@@ -40,8 +40,6 @@ def train(
     ----------
     dataset
         Folder that `magtwin dataset build` made.
-    out
-        Weights to write, .safetensors.
     config
         TOML of the options below, with _ for -, and of layers, batch, patience, threads, device, penalty and
         weighting. Options on the command line override it.

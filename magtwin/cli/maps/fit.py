@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.maps.map import LAYERS, Earth, Kernel, Sources, earth_nt, map_app
-from magtwin.cli.options import Flag, Force, Jobs, Lab, Licence, Seed, Whole, headings_rad
+from magtwin.cli.options import Flag, Force, Jobs, Lab, Licence, Scene, Seed, Whole, headings_rad
 from magtwin.cli.terminal import Done, named, progress
 from magtwin.errors import InputError
 from magtwin.io.surveys.columns import About, Columns
@@ -197,7 +197,7 @@ def map_validate(
 
 @map_app.command(name="survey")
 def map_survey(
-    scene: Path,
+    scene: Scene,
     *,
     out: Path,
     adopt: Flag = False,
@@ -217,14 +217,13 @@ def map_survey(
 ) -> Done:
     """Survey a scene as its robot would, node by node, with sensor noise and pose errors.
 
-    The field is that of the stage as it is now: move a desk in it, survey again, and `magtwin map diff` finds
-    the change. With --adopt, the stage reads the new map from then on. The map's variance includes noise and
-    pose errors. Nodes where the sensor loses lock or the robot cannot stand are masked.
+    The field, whose Earth's part must be known, is that of the stage as it is now: move a desk in it, survey
+    again, and `magtwin map diff` finds the change. With --adopt, the stage reads the new map from then on.
+    The map's variance includes noise and pose errors. Nodes where the sensor loses lock or the
+    robot cannot stand are masked.
 
     Parameters
     ----------
-    scene
-        USD stage with a known Earth field, or the name of a scene that ships with magtwin: lab.
     out
         Map layer (.usdc) or readings (.parquet) to write.
     adopt

@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from magtwin.cli.maps.map import LAYERS, PICTURES, MapFile, map_app
-from magtwin.cli.options import Force
+from magtwin.cli.options import Force, Scene
 from magtwin.cli.terminal import Done, named, step
 
 
@@ -101,15 +101,15 @@ def map_export(file: MapFile, *, out: Path, force: Force = False) -> Done:
 
 
 @map_app.command(name="occupancy")
-def map_occupancy(scene: Path, *, out: Path, resolution_m: float | None = None, force: Force = False) -> Done:
+def map_occupancy(
+    scene: Scene, *, out: Path, resolution_m: float | None = None, force: Force = False
+) -> Done:
     """Write walls, furniture and floor of a scene as an occupancy grid, for nav2's map_server.
 
     Occupied is where a simulated robot stops. The floor is free, and what is beyond it is unknown.
 
     Parameters
     ----------
-    scene
-        Scene (.usd, .usda, .usdc), or the name of a shipped one: lab.
     out
         File to write (.yaml). The picture (.pgm) is written beside it.
     resolution_m

@@ -10,8 +10,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from magtwin.cli import options as opt
 from magtwin.cli.app import app
-from magtwin.cli.options import Folder, Force, Gamepad, Lab, MapLayer, Network, Plant, Seed, Session
 from magtwin.cli.runs.run import SHOWN, save_picture
 from magtwin.cli.terminal import Done, named, note, silence, step
 from magtwin.errors import InputError
@@ -25,18 +25,18 @@ STATUS_HZ = 10.0
 
 @app.command
 def drive(
-    scene: Path,
+    scene: opt.Scene,
     *,
-    out: Folder = Path("drive"),
-    lab: Lab = "",
-    map_layer: MapLayer = None,
-    gamepad: Gamepad = None,
-    network: Network = None,
-    seed: Seed = 0,
-    session: Session = None,
-    plant: Plant = None,
+    out: opt.Folder = Path("drive"),
+    lab: opt.Lab = "",
+    map_layer: opt.MapLayer = None,
+    gamepad: opt.Gamepad = None,
+    network: opt.Network = None,
+    seed: opt.Seed = 0,
+    session: opt.Session = None,
+    plant: opt.Plant = None,
     live: bool = True,
-    force: Force = False,
+    force: opt.Force = False,
 ) -> Done:
     """Drive a scene's robot by hand, in real time, and write the run.
 
@@ -46,8 +46,6 @@ def drive(
 
     Parameters
     ----------
-    scene
-        USD stage to drive in, or the name of a scene that ships with magtwin: lab.
     live
         Show the drive in a Rerun viewer while it goes on, if a window can be opened.
     """

@@ -5,21 +5,13 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+from magtwin.cli import options as opt
 from magtwin.cli.app import app
-from magtwin.cli.options import (
-    RECORDED,
-    Force,
-    OutUnit,
-    RecordedOptions,
-    RunScene,
-    UsdFps,
-    reads_recordings,
-)
 from magtwin.cli.terminal import Done, named, progress, silence, step
 
 
 @app.command
-def info(file: Path, *, recorded: RecordedOptions = RECORDED) -> Done:
+def info(file: Path, *, recorded: opt.RecordedOptions = opt.RECORDED) -> Done:
     """Print what a run, a stage, a map or a network holds, and its origin.
 
     Parameters
@@ -37,11 +29,8 @@ def info(file: Path, *, recorded: RecordedOptions = RECORDED) -> Done:
 
 
 @app.command
-@reads_recordings
-def view(
-    *files: Annotated[Path, Parameter(required=True)],
-    scene: RunScene = None,
-) -> Done:
+@opt.reads_recordings
+def view(*files: Annotated[Path, Parameter(required=True)], scene: opt.RunScene = None) -> Done:
     """Show runs or a stage in a viewer until it is closed.
 
     Runs are shown in the Rerun viewer, in their lab if their scene is found. Several runs share one timeline,
@@ -64,11 +53,11 @@ def convert(
     run: Path,
     out: Path,
     *,
-    scene: RunScene = None,
-    out_unit: OutUnit = None,
-    usd_fps: UsdFps = None,
-    recorded: RecordedOptions = RECORDED,
-    force: Force = False,
+    scene: opt.RunScene = None,
+    out_unit: opt.OutUnit = None,
+    usd_fps: opt.UsdFps = None,
+    recorded: opt.RecordedOptions = opt.RECORDED,
+    force: opt.Force = False,
 ) -> Done:
     """Convert a run to another format, or import a ROS bag.
 
@@ -98,7 +87,7 @@ def fetch(
     *,
     out: Path | None = None,
     base_url: str | None = None,
-    force: Force = False,
+    force: opt.Force = False,
 ) -> Done:
     """Download original data at a pinned commit, and check each file's SHA-256.
 

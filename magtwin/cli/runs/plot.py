@@ -10,6 +10,9 @@ from magtwin.cli.options import Force, RunScene, headings_rad, reads_recordings
 from magtwin.cli.terminal import Done, named, note, progress
 from magtwin.errors import InputError
 
+MANY, FASTER = 100, "faster with --size 640x360, --fps 10 or a higher --pace"
+"""Frames of a film above which it takes minutes without a graphics card, and what is said then."""
+
 
 @app.command
 @reads_recordings
@@ -65,7 +68,11 @@ def plot(
     options: dict[str, Any] = {"at_s": at_s, "camera": camera, "scene": scene, "pace": pace, "fps": fps}
     options |= {"headings": headings_deg and headings_rad(headings_deg), "size": size and _size(size)}
     with progress(f"Drawing {files[0].name}", "frames") as advance:
-        file, messages = draw(files, out, show=show, force=force, advance=advance, **options)
+
+        def drawn(done: int, total: int) -> None:
+            advance(done, total, FASTER if total > MANY else "")
+
+        file, messages = draw(files, out, show=show, force=force, advance=drawn, **options)
     for message in messages:
         note(f"the viewer reports: {message}")
     return Done(wrote=file)

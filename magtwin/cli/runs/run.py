@@ -9,20 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+from magtwin.cli import options as opt
 from magtwin.cli.app import app
-from magtwin.cli.options import (
-    Flag,
-    Folder,
-    Force,
-    Lab,
-    Magnetometer,
-    MapLayer,
-    Network,
-    Plant,
-    Seed,
-    Session,
-    check_pace,
-)
 from magtwin.cli.settings import RUN, RunOptions, RunSettings
 from magtwin.cli.terminal import Done, named, note, progress, step
 from magtwin.errors import InputError, find
@@ -37,7 +25,7 @@ SHOWN = ("duration", "distance driven", "readings", "b_total_nt", "error")
 
 
 @app.command
-def demo(*, out: Folder = Path("demo"), seed: Seed = 0, force: Force = False) -> Done:
+def demo(*, out: opt.Folder = Path("demo"), seed: opt.Seed = 0, force: opt.Force = False) -> Done:
     """Author a lab and a TurtleBot 4, drive a figure of eight and log what the magnetometer reads.
 
     It writes the stages, run.html (plays the run in a browser), run.rrd (opens in Rerun), run.parquet and
@@ -79,26 +67,26 @@ def demo(*, out: Folder = Path("demo"), seed: Seed = 0, force: Force = False) ->
 
 @app.command
 def run(
-    scene: Path,
+    scene: opt.Scene,
     *,
     path: str | None = None,
-    fit: Flag = False,
-    lab: Lab = "",
-    map_layer: MapLayer = None,
+    fit: opt.Flag = False,
+    lab: opt.Lab = "",
+    map_layer: opt.MapLayer = None,
     robot: str | None = None,
     engine: Literal["kinematic", "newton"] = "kinematic",
-    network: Network = None,
-    magnetometer: Magnetometer = None,
-    plant: Plant = None,
-    session: Session = None,
-    seed: Seed = 0,
+    network: opt.Network = None,
+    magnetometer: opt.Magnetometer = None,
+    plant: opt.Plant = None,
+    session: opt.Session = None,
+    seed: opt.Seed = 0,
     speed: float = 0.2,
     duration_s: float | None = None,
-    live: Flag = False,
-    scans: Flag = False,
+    live: opt.Flag = False,
+    scans: opt.Flag = False,
     out: Outs = None,
     settings: RunOptions = RUN,
-    force: Force = False,
+    force: opt.Force = False,
 ) -> Done:
     """Drive a scene's robot along a path and write the run.
 
@@ -106,8 +94,6 @@ def run(
 
     Parameters
     ----------
-    scene
-        USD stage to drive in, or the name of a scene that ships with magtwin: lab.
     path
         sine, fast_sine, lawnmower, split_lawnmower, figure8, narrow_figure8, continuous_cycle, loops,
         curvilinear, curvilinear_2; A to E (Table 1 of Penumarti et al. 2025); random (like a human driver,
@@ -127,9 +113,8 @@ def run(
         Duration of the run [s]. If it is longer than one pass along the path, the robot drives further laps.
         Default: once along the path.
     out
-        Output; may be repeated. A file gets the format of its suffix: .rrd, .parquet, .mcap, .csv, .npz,
-        .usd, .usda or .usdc. A name without a suffix is a folder with run.rrd, run.parquet and run.png.
-        Default: the folder run.
+        Folder to make, with run.rrd, run.parquet and run.png, or file to write, in the format of its suffix:
+        .rrd, .parquet, .mcap, .csv, .npz, .usd, .usda or .usdc. May be repeated. Default: the folder run.
     scans
         Cast the LiDAR's rays while it spins. Files .rrd and .mcap contain the scans. For .parquet, .csv and
         .npz, the scans go into a second file such as run.scans.parquet.
@@ -212,7 +197,7 @@ def _check(
     if settings.pace is not None:
         if not (live or settings.viewer):
             raise InputError("`pace` is for a run that is shown; give --live, or drop it")
-        check_pace(settings.pace)
+        opt.check_pace(settings.pace)
     controller, newton = settings.controller, engine == "newton"
     free = what is not None and not isinstance(what, str)  # driven without a path
     no_path = free or what == "random"

@@ -3,23 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+from magtwin.cli import options as opt
 from magtwin.cli.app import app
-from magtwin.cli.options import (
-    Dask,
-    Flag,
-    Folder,
-    Force,
-    Jobs,
-    Magnetometer,
-    MapLayer,
-    Names,
-    Plant,
-    RateHz,
-    Seed,
-    Sessions,
-    Shard,
-    Whole,
-)
 from magtwin.cli.settings import SWEEP, SweepOptions
 from magtwin.cli.terminal import Done, continued_by_a_repeat, named, progress, step
 from magtwin.errors import InputError
@@ -30,24 +15,24 @@ RUNS_A_SESSION = 5
 
 @app.command
 def sweep(
-    scene: Path,
+    scene: opt.Scene,
     *,
-    out: Folder = Path("runs"),
-    count: Whole = 100,
-    path: Names = None,
-    fit: Flag = False,
-    map_layer: MapLayer = None,
-    magnetometer: Magnetometer = None,
-    plant: Plant = None,
-    seed: Seed = 0,
-    sessions: Sessions = None,
+    out: opt.Folder = Path("runs"),
+    count: opt.Whole = 100,
+    path: opt.Names = None,
+    fit: opt.Flag = False,
+    map_layer: opt.MapLayer = None,
+    magnetometer: opt.Magnetometer = None,
+    plant: opt.Plant = None,
+    seed: opt.Seed = 0,
+    sessions: opt.Sessions = None,
     duration_s: float | None = None,
-    rate_hz: RateHz = None,
-    jobs: Jobs = None,
-    shard: Shard = None,
-    dask: Dask = None,
+    rate_hz: opt.RateHz = None,
+    jobs: opt.Jobs = None,
+    shard: opt.Shard = None,
+    dask: opt.Dask = None,
     settings: SweepOptions = SWEEP,
-    force: Force = False,
+    force: opt.Force = False,
 ) -> Done:
     """Drive a scene's robot many times and write a data set: one Parquet file per run, and runs.csv.
 
@@ -63,8 +48,6 @@ def sweep(
 
     Parameters
     ----------
-    scene
-        USD stage to drive in, or the name of a scene that ships with magtwin: lab.
     count
         Number of runs.
     path
