@@ -24,7 +24,6 @@ from magtwin.figures.canvas import (
     legend_above,
     new_figure,
     short_name,
-    stretches,
 )
 from magtwin.figures.maps import FloorPlan, map_charts
 from magtwin.figures.page import Page, Section, Table, text_of
@@ -36,6 +35,7 @@ from magtwin.report.verdict import HOLDS_ONE, Tally
 from magtwin.run.compare import ERRORS, Agreement, Comparison, Traversals, errors_of, terms_of
 from magtwin.run.figures import prediction_nt
 from magtwin.run.run import COLUMNS, Metadata, Run
+from magtwin.run.thinning import stretches
 
 MOST_FIGURES = 14
 """Figures above which their table is folded."""

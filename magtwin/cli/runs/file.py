@@ -6,11 +6,14 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from magtwin.cli.app import app
+from magtwin.cli.maps.fit import READING, ReadingOptions
 from magtwin.cli.options import (
     RECORDED,
     Force,
     OutUnit,
+    Recorded,
     RecordedOptions,
+    Remap,
     RunScene,
     UsdFps,
     reads_recordings,
@@ -19,7 +22,7 @@ from magtwin.cli.terminal import Done, named, progress, silence, step
 
 
 @app.command
-def info(file: Path, *, recorded: RecordedOptions = RECORDED) -> Done:
+def info(file: Path, *, reading: ReadingOptions = READING, remap: Remap = None) -> Done:
     """Print what a run, a stage, a map or a network holds, and its origin.
 
     Parameters
@@ -33,7 +36,10 @@ def info(file: Path, *, recorded: RecordedOptions = RECORDED) -> Done:
     from magtwin.io.info import info_of
 
     step(f"Reading {file.name}")
-    return Done(info_of(file, **recorded.options), whole=True)
+    told = {name: getattr(reading.columns, name) for name in ("unit", "scale")}
+    told |= {name: getattr(reading, name) for name in ("field_topic", "pose_topic")}
+    how = Recorded(remap=remap, **told).options
+    return Done(info_of(file, columns=reading.columns, waypoints=reading.waypoints, **how), whole=True)
 
 
 @app.command

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
+from magtwin.run.thinning import stretches
 from magtwin.tables.labels import words_of
 from magtwin.tables.table import Column, Table, since_1970
 
@@ -114,7 +115,7 @@ def _stills(t: Array, acceleration: Array) -> list[tuple[float, float]]:
     for part in acceleration.T:
         mean = np.bincount(second, part) / count
         spread += np.bincount(second, (part - mean[second]) ** 2) / count
-    return _stretches(t[0] + np.append(halves, halves[-1] + 1) / 2, np.sqrt(spread) < STILL_M_S2)
+    return _pauses(t[0] + np.append(halves, halves[-1] + 1) / 2, np.sqrt(spread) < STILL_M_S2)
 
 
 def _quiet(table: Table, t: Array) -> list[tuple[float, float]]:
@@ -134,11 +135,10 @@ def _quiet(table: Table, t: Array) -> list[tuple[float, float]]:
     if noise == 0 or np.median(change) < LIVELY * noise:
         return []
     edges = (t[window // 2 :])[: len(change) + 1]
-    return _stretches(edges, change < QUIET * noise)
+    return _pauses(edges, change < QUIET * noise)
 
 
-def _stretches(edges: Array, flags: NDArray[np.bool_]) -> list[tuple[float, float]]:
-    """Begin and end of stretches of flags of `LEAST_PAUSE_S` or more."""
-    change = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    pairs = [(float(edges[a]), float(edges[b])) for a, b in change.reshape(-1, 2)]
+def _pauses(edges: Array, flags: NDArray[np.bool_]) -> list[tuple[float, float]]:
+    """Begin and end of the stretches of flags of `LEAST_PAUSE_S` or more."""
+    pairs = edges[stretches(flags)].tolist()
     return [(a, b) for a, b in pairs if b - a >= LEAST_PAUSE_S]
