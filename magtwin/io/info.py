@@ -26,12 +26,13 @@ def info_of(
     *,
     columns: Columns | None = None,
     waypoints: Path | None = None,
+    step_m: float | None = None,
     **reading: Any,
 ) -> Report:
     """A report on the content and origin of a file: a run, stage, map, survey, table, log or network.
 
-    `reading` are options of `magtwin.io.formats.read_run`, for a run; `columns` and `waypoints` those of
-    `magtwin.io.surveys.readings.read_readings`, for a survey.
+    `columns`, `waypoints` and `step_m` are options of `magtwin.io.surveys.readings.read_readings`, for a
+    survey, and `reading` those of `magtwin.io.formats.read_run`, for a run.
     """
     file = existing(shipped_or(Path(path)), "file")
     unit = {name: reading.get(name) for name in ("unit", "scale")}
@@ -39,7 +40,7 @@ def info_of(
     if not is_bag(file) and is_survey(file):
         if "topics" in reading:
             raise InputError(f"{file}: no bag; drop --field-topic, --pose-topic and --remap")
-        return info_of_survey(file, told, waypoints)
+        return info_of_survey(file, told, waypoints, step_m)
     if waypoints is not None or replace(told, unit=None, scale=None) != Columns():
         raise InputError(f"{file}: no table of readings; drop --waypoints and the options that name columns")
     if is_bag(file):

@@ -312,7 +312,7 @@ def _others(path: Path, columns: Mapping[str, str] | None, error: InputError | N
     run = _by_quantity(pa.table([pa.array(v) for v in kept.values()], names), path)
     if "t" not in run.column_names:
         raise InputError(
-            f"{path}: no column of time, so no run (columns: {listed(names)}); magtwin map import takes surveys"
+            f"{path}: no column of time (columns: {listed(names)}); if a survey, magtwin map import takes it"
         )
     return run_of(run, path)
 

@@ -28,7 +28,11 @@ class Reading:
 
     waypoints: Path | None = None
     """Table of t,x,y, or of t and notes such as "1.5,2": when the sensor was carried past which places [m].
-    For the log of a phone, which has no positions."""
+    For the log of a phone, which has no positions. Or of x,y alone, in the order of the walk."""
+
+    step_m: float | None = None
+    """Length of a step [m], for waypoints without times in a log with accelerations. Default: a steady pace
+    from the first to the last."""
 
     pose_topic: str | None = None
     """Topic of the poses in a bag, if it has several."""

@@ -39,7 +39,8 @@ def info(file: Path, *, reading: ReadingOptions = READING, remap: Remap = None) 
     told = {name: getattr(reading.columns, name) for name in ("unit", "scale")}
     told |= {name: getattr(reading, name) for name in ("field_topic", "pose_topic")}
     how = Recorded(remap=remap, **told).options
-    return Done(info_of(file, columns=reading.columns, waypoints=reading.waypoints, **how), whole=True)
+    how |= {name: getattr(reading, name) for name in ("columns", "waypoints", "step_m")}
+    return Done(info_of(file, **how), whole=True)
 
 
 @app.command

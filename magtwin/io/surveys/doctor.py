@@ -86,17 +86,22 @@ def examine(
     return Report("field", tuple(figures), metadata | ({"doubts": doubts} if doubts else {}))
 
 
-def info_of_survey(file: Path, told: Columns, waypoints: Path | None) -> Report:
+def info_of_survey(file: Path, told: Columns, waypoints: Path | None, step_m: float | None) -> Report:
     """What the field in a table or a log is like, what it is fit for, and the command to type next.
 
-    `told` are columns and units that the user knows, and `waypoints` the table of a walk's marks.
+    `told` are columns and units that the user knows, and `waypoints` the table of a walk's marks,
+    with the length of a step [m].
     """
     from magtwin.io.surveys.logs import table_of_log
     from magtwin.io.surveys.tabled import field_of_table, rows_of_table
 
-    table = table_of_log(file, waypoints)
+    table = table_of_log(file, waypoints, step_m)
     vector, b, t, unit = field_of_table(table, told)
-    options = {name: value for name, value in {"waypoints": waypoints, **asdict(told)}.items() if value}
+    options = {
+        name: value
+        for name, value in {"waypoints": waypoints, "step_m": step_m, **asdict(told)}.items()
+        if value
+    }
     flags = [word for name, value in options.items() for word in (f"--{name.replace('_', '-')}", str(value))]
     then = shlex.join([str(file), *flags])
     roles = [role for role, symbols in (("odometry", ("v", "w")),) if table.find(*symbols)]
