@@ -297,31 +297,32 @@ def _others(path: Path, columns: Mapping[str, str] | None, error: InputError | N
             raise
         raise error from None
     kept, texts = dict[str, Any](), list[str]()
-    for name in table.names:
+    for name, column in zip(table.names, table.columns, strict=True):
+        if isinstance(column.cells, np.ndarray) and column.cells.dtype.kind in "fiub":
+            kept[name] = column.cells
+            continue
         for read in (table.numbers, table.times):
             with suppress(InputError):
                 kept[name] = read(name)
                 break
         else:
             texts.append(name)
-    if wrong := {*COLUMNS} & {*texts} or (() if kept else texts):
+    names = _renamed([*kept], columns or {}, path)
+    if wrong := {*COLUMNS} & {*texts}:
         raise error or InputError(f"{path}: column {min(wrong)!r} must hold numbers or flags, got texts")
+    if "t" not in names and not table.find("t"):
+        known = f"column 't' is missing (columns: {listed(table.names)})"
+        raise error or InputError(f"{path}: not a Run: {known}; if a survey, magtwin map import takes it")
     if notes := [*table.notes, *([f"without the texts in {listed(texts)}"] if texts else [])]:
         warnings.warn(f"{path}: read {', '.join(notes)}", RepairWarning, stacklevel=4)
-    names = _renamed([*kept], columns or {}, path)
-    run = _by_quantity(pa.table([pa.array(v) for v in kept.values()], names), path)
-    if "t" not in run.column_names:
-        raise InputError(
-            f"{path}: no column of time (columns: {listed(names)}); if a survey, magtwin map import takes it"
-        )
-    return run_of(run, path)
+    return run_of(_by_quantity(pa.table([pa.array(v) for v in kept.values()], names), path), path)
 
 
 def _by_quantity(table: pa.Table, path: Path) -> pa.Table:
     """A table of another program, with the names and units of a Run for what it names otherwise."""
     notes = []
     for symbols, own in _OWN.items():
-        free = (n for n in table.column_names if not {n, n.rpartition("_")[0]} & COLUMNS.keys())
+        free = (n for n in table.column_names if n not in COLUMNS and not _is_part(n))
         columns = Table(tuple(Column(name, (), path, None) for name in free))
         labels = [] if set(own) & set(table.column_names) else columns.find(*symbols)
         for symbol, label, name in zip(symbols, labels, own, strict=False):
@@ -336,6 +337,12 @@ def _by_quantity(table: pa.Table, path: Path) -> pa.Table:
     if notes:
         warnings.warn(f"{path}: read {', '.join(notes)}", RepairWarning, stacklevel=4)
     return _on_the_floor(table)
+
+
+def _is_part(name: str) -> bool:
+    """Whether a name is that of a part of a vector of a Run, such as `odom_p_x`."""
+    vector = COLUMNS.get(name.rpartition("_")[0])
+    return vector is not None and vector.width > 1
 
 
 def _on_the_floor(table: pa.Table) -> pa.Table:

@@ -45,10 +45,7 @@ def info(file: Path, *, reading: ReadingOptions = READING, remap: Remap = None) 
 
 @app.command
 @reads_recordings
-def view(
-    *files: Annotated[Path, Parameter(required=True)],
-    scene: RunScene = None,
-) -> Done:
+def view(*files: Annotated[Path, Parameter(required=True)], scene: RunScene = None) -> Done:
     """Show runs or a stage in a viewer until it is closed.
 
     Runs are shown in the Rerun viewer, in their lab if their scene is found. Several runs share one timeline,

@@ -24,11 +24,7 @@ SECTORS = 12  # Sectors of 30 degrees in which headings are counted
 LEAST_READINGS, LEAST_SPAN_M = 100, 0.5  # Fewest readings and least extent [m] of a map
 LEAST_SECTORS = 6  # Fewest sectors for the hard iron, and for a robot's own field
 
-USES = {
-    "map": ("pose",),
-    "training": ("pose", "odometry", "imu", "battery"),
-    "localization": ("odometry",),
-}
+USES = {"map": ("pose",), "training": ("pose", "odometry", "imu", "battery"), "localization": ("odometry",)}
 """Roles beside the field that each use needs."""
 
 
@@ -116,13 +112,7 @@ def info_of_survey(file: Path, told: Columns, waypoints: Path | None, step_m: fl
         p, yaw = np.full((len(b), 2), np.nan), np.full(len(b), np.nan)
         p[rows], yaw[rows] = readings.p_xy, readings.yaw
         report = examine(
-            b,
-            vector_nt=vector,
-            t=t,
-            p_xy=p,
-            yaw=None if readings.by_hand else yaw,
-            roles=roles,
-            unit=unit,
+            b, vector_nt=vector, t=t, p_xy=p, yaw=None if readings.by_hand else yaw, roles=roles, unit=unit
         )
         more = {"taken": taken} if (taken := taken_of(readings)) else {}
     more |= {"next": f"magtwin map import {then}"} if then else {}
