@@ -244,9 +244,9 @@ def _by_time(table: Table) -> Table:
     lines = None if value[0].lines is None else [value[0].lines[row] for row in first]
     columns = [replace(c, cells=np.asarray(c.cells)[first].astype(str).tolist(), lines=lines) for c in rest]
     for name in dict.fromkeys(key[0].cells):
-        cells = np.full(len(rows), "nan", object)
-        cells[np.array(at)[names == name]] = np.asarray(value[0].cells)[names == name].astype(str)
-        columns.append(Column(str(name), cells.tolist(), table.path, lines))
+        texts = np.full(len(rows), "nan", object)
+        texts[np.array(at)[names == name]] = np.asarray(value[0].cells)[names == name].astype(str)
+        columns.append(Column(str(name), texts.tolist(), table.path, lines))
     own, others = ([c.name for c in part] for part in (columns[: len(rest)], columns[len(rest) :]))
     wide = Table(tuple(columns), (*table.notes, f"{key[0].name} as {listed(others)}, by {_and(own)}"))
     known = any(wide.find(*some) for some in (("x", "y"), ("field",), ("bx", "by", "bz")))

@@ -124,7 +124,6 @@ def changed(change):
         (table(clock=[0.0, 1.0], b=[1.0, 2.0]), "column 't' is missing"),
         (table(t=[0.0], odom_p_x=[1.0]), "column 'odom_p_y' is missing beside 'odom_p_x'"),
         (table(t=["now", "then"]), "column 't' must hold numbers or flags"),
-        (table(t=[0.0, 1.0], yaw=[0.5, None]), "column 'yaw', row 1: no value"),
         (table(t=[0.0, 2.0, 1.0]), "row 2 has 1 s after 2 s"),
         (table(t=[0.0, 1.0], flag_bump=[0.0, 0.5]), r"'flag_bump', row 1: a flag is 0 or 1, got 0\.5"),
     ],
