@@ -45,7 +45,7 @@ from magtwin.run.run import COLUMNS, Run, check_clock
 from magtwin.run.spool import Spool, blocks
 from magtwin.tables.parquet import load_parquet
 from magtwin.tables.quantities import QUANTITIES
-from magtwin.tables.table import Column, Table, read_table
+from magtwin.tables.table import Column, Table, read_table, since_1970
 
 _ABOUT = "magtwin"  # Name of the member of an npz with the metadata, and first word of a CSV
 
@@ -296,6 +296,8 @@ def _others(path: Path, columns: Mapping[str, str] | None, error: InputError | N
         if error is None:
             raise
         raise error from None
+    if (twice := Counter(table.names).most_common(1)[0])[1] > 1:
+        raise InputError(f"{path}: two columns are called {twice[0]!r}; rename one")
     kept, texts = dict[str, Any](), list[str]()
     for name, column in zip(table.names, table.columns, strict=True):
         if isinstance(column.cells, np.ndarray) and column.cells.dtype.kind in "fiub":
@@ -330,7 +332,9 @@ def _by_quantity(table: pa.Table, path: Path) -> pa.Table:
             if pa.types.is_floating(kind := table.schema.field(k).type) or pa.types.is_integer(kind):
                 values = table.column(k).to_numpy()
                 factor = QUANTITIES[symbol].units.get(columns.unit(label, symbol))
-                if factor is None:
+                if symbol == "t":
+                    values, factor = since_1970(Table((Column(label, values, path, None),)), label)[0], 1.0
+                elif factor is None:
                     factor = NT_PER[unit_by_size(values) or "nT"] if symbol == "field" else 1.0
                 table = table.set_column(k, name, pa.array(factor * values))
                 notes.append(f"{label} as {name}")
