@@ -35,7 +35,7 @@ def info_of(
     survey, and `reading` those of `magtwin.io.formats.read_run`, for a run.
     """
     file = existing(shipped_or(Path(path)), "file")
-    unit = {name: reading.get(name) for name in ("unit", "scale")}
+    unit: dict[str, Any] = {name: reading.get(name) for name in ("unit", "scale")}
     told = columns or Columns(**unit)
     if not is_bag(file) and is_survey(file):
         if "topics" in reading:

@@ -312,12 +312,10 @@ def _others(path: Path, columns: Mapping[str, str] | None, error: InputError | N
     names = _renamed([*kept], columns or {}, path)
     if wrong := {*COLUMNS} & {*texts}:
         raise error or InputError(f"{path}: column {min(wrong)!r} must hold numbers or flags, got texts")
-    if "t" not in names and not table.find("t"):
-        known = f"column 't' is missing (columns: {listed(table.names)})"
-        raise error or InputError(f"{path}: not a Run: {known}; if a survey, magtwin map import takes it")
+    run = run_of(_by_quantity(pa.table([pa.array(v) for v in kept.values()], names), path), path)
     if notes := [*table.notes, *([f"without the texts in {listed(texts)}"] if texts else [])]:
         warnings.warn(f"{path}: read {', '.join(notes)}", RepairWarning, stacklevel=4)
-    return run_of(_by_quantity(pa.table([pa.array(v) for v in kept.values()], names), path), path)
+    return run
 
 
 def _by_quantity(table: pa.Table, path: Path) -> pa.Table:
@@ -338,6 +336,9 @@ def _by_quantity(table: pa.Table, path: Path) -> pa.Table:
                     factor = NT_PER[unit_by_size(values) or "nT"] if symbol == "field" else 1.0
                 table = table.set_column(k, name, pa.array(factor * values))
                 notes.append(f"{label} as {name}")
+    if "t" not in table.column_names:
+        known = f"column 't' is missing (columns: {listed(table.column_names)})"
+        raise InputError(f"{path}: not a Run: {known}; if a survey, magtwin map import takes it")
     if notes:
         warnings.warn(f"{path}: read {', '.join(notes)}", RepairWarning, stacklevel=4)
     return _on_the_floor(table)
