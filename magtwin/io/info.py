@@ -13,7 +13,6 @@ from magtwin.files.file import existing
 from magtwin.files.kinds import kind_of, shipped_or
 from magtwin.io.formats import FORMATS, is_bag, read_run
 from magtwin.io.surveys.columns import Columns
-from magtwin.io.surveys.doctor import info_of_survey
 from magtwin.io.surveys.logs import is_survey
 from magtwin.report.report import Figure, Report
 
@@ -40,6 +39,8 @@ def info_of(
     if not is_bag(file) and is_survey(file):
         if "topics" in reading:
             raise InputError(f"{file}: no bag; drop --field-topic, --pose-topic and --remap")
+        from magtwin.io.surveys.doctor import info_of_survey
+
         return info_of_survey(file, told, waypoints, step_m)
     if waypoints is not None or replace(told, unit=None, scale=None) != Columns():
         raise InputError(f"{file}: no table of readings; drop --waypoints and the options that name columns")
