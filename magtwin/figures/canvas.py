@@ -25,7 +25,7 @@ from magtwin.errors import InputError
 from magtwin.figures.style import LIDAR, styled
 from magtwin.files.outputs import output
 from magtwin.report.summary import printable_lines
-from magtwin.run.thinning import newest
+from magtwin.run.thinning import newest, stretches
 
 Array = NDArray[np.float64]
 
@@ -203,11 +203,6 @@ def coloured_line(
     line = LineCollection(segments, array=middle, cmap=colours, clim=limits, **look)
     ax.add_collection(line)
     return line
-
-
-def stretches(on: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """First index and the one after the last of each stretch in which a flag is set, shape (K, 2)."""
-    return np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int))).reshape(-1, 2)
 
 
 def shade(ax: Axes, t: Array, on: NDArray[np.bool_], *, colour: str = LIDAR, name: str = "_") -> None:

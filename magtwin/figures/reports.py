@@ -25,6 +25,7 @@ from magtwin.report.verdict import HOLDS_ONE, Tally
 from magtwin.run.compare import ERRORS, Agreement, Comparison, Traversals, errors_of, terms_of
 from magtwin.run.figures import prediction_nt
 from magtwin.run.run import COLUMNS, Metadata, Run
+from magtwin.run.thinning import stretches
 
 MOST_FIGURES = 14
 """Figures above which their table is folded."""
@@ -313,7 +314,7 @@ def _events(run: Run) -> list[tuple[str, str, int, str]]:
     events = []
     for name, on in run.items():
         if name.startswith("flag_") and on.dtype == bool and on.any():
-            ends = [(run["t"][first], run["t"][after - 1]) for first, after in canvas.stretches(on)]
+            ends = [(run["t"][first], run["t"][after - 1]) for first, after in stretches(on)]
             text = ", ".join(f"{a:.2f}–{b:.2f}" if b > a else f"{a:.2f}" for a, b in ends[:MOST_SPANS])
             text += f" and {len(ends) - MOST_SPANS:,} more" if len(ends) > MOST_SPANS else ""
             events.append((name, COLUMNS[name].doc if name in COLUMNS else "", int(on.sum()), text))

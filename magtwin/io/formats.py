@@ -39,21 +39,15 @@ Function = Callable[..., Any]
 class Format:
     """A kind of file that holds a Run."""
 
-    name: str
-    """Its name, for messages."""
-
+    name: str  # Its name, for messages
     read: Function | str
     """The reader, `read(path, **options) -> Run`, or "module:function", which is imported when needed."""
 
     write: Function | str | None = None
     """The writer, `write(run, path, *, force, **options)`, likewise. None: the format is only read."""
 
-    reads: frozenset[str] = frozenset()
-    """Options of the reader."""
-
-    instead: str = ""
-    """What to write, if the format is only read. Default: one of the others."""
-
+    reads: frozenset[str] = frozenset()  # Options of the reader
+    instead: str = ""  # What to write, if the format is only read. Default: one of the others.
     takes: frozenset[str] = frozenset()
     """Arguments of the writer: of `twin`, `planned`, `scans` and `scene_file`, which other formats are not
     given, and options, which other formats refuse."""

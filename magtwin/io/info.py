@@ -12,6 +12,7 @@ from magtwin.field.survey.nodes import read_survey
 from magtwin.files.file import existing
 from magtwin.files.kinds import kind_of, shipped_or
 from magtwin.io.formats import FORMATS, is_bag, read_run
+from magtwin.io.surveys.columns import Columns
 from magtwin.io.surveys.logs import is_survey
 from magtwin.report.report import Figure, Report
 
@@ -19,12 +20,30 @@ STAGES = (".usd", ".usda", ".usdc", ".usdz")
 NETWORKS = (".safetensors", ".pth", ".onnx")
 
 
-def info_of(path: str | os.PathLike[str], **reading: Any) -> Report:
+def info_of(
+    path: str | os.PathLike[str],
+    *,
+    columns: Columns | None = None,
+    waypoints: Path | None = None,
+    step_m: float | None = None,
+    **reading: Any,
+) -> Report:
     """A report on the content and origin of a file: a run, stage, map, survey, table, log or network.
 
-    `reading` are options of `magtwin.io.formats.read_run`, for a run.
+    `columns`, `waypoints` and `step_m` are options of `magtwin.io.surveys.readings.read_readings`, for a
+    survey, and `reading` those of `magtwin.io.formats.read_run`, for a run.
     """
     file = existing(shipped_or(Path(path)), "file")
+    unit: dict[str, Any] = {name: reading.get(name) for name in ("unit", "scale")}
+    told = columns or Columns(**unit)
+    if not is_bag(file) and is_survey(file):
+        if "topics" in reading:
+            raise InputError(f"{file}: no bag; drop --field-topic, --pose-topic and --remap")
+        from magtwin.io.surveys.doctor import info_of_survey
+
+        return info_of_survey(file, told, waypoints, step_m)
+    if waypoints is not None or replace(told, unit=None, scale=None) != Columns():
+        raise InputError(f"{file}: no table of readings; drop --waypoints and the options that name columns")
     if is_bag(file):
         from magtwin.io.recording.contents import info_of_bag
 
@@ -33,7 +52,7 @@ def info_of(path: str | os.PathLike[str], **reading: Any) -> Report:
             return report
         run = info_of_run(file, **reading)
         return replace(run, metadata={**run.metadata, "topics": report.metadata["topics"]})
-    if file.is_dir() and not is_survey(file):
+    if file.is_dir():
         return (
             map_metadata(read_survey(file)[0])
             if any(file.glob("*_map.csv"))
@@ -48,10 +67,6 @@ def info_of(path: str | os.PathLike[str], **reading: Any) -> Report:
         return report_onnx(file) if file.suffix.lower() == ".onnx" else load_predictor(file).report(str(file))
     if file.suffix.lower() in STAGES:
         return _info_of_usd(file)
-    if is_survey(file):
-        from magtwin.io.surveys.doctor import info_of_survey
-
-        return info_of_survey(file)
     if file.suffix.lower() in FORMATS:
         return info_of_run(file, **reading)
     if kind := kind_of(file):

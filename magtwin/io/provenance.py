@@ -17,15 +17,7 @@ from magtwin.path.room import COVERAGE
 from magtwin.report.report import Figure, Report
 from magtwin.run.run import COLUMNS, Run
 from magtwin.sim.motion.drive_input import path_metadata
-from magtwin.twin import (
-    in_session_of,
-    lab_and_map,
-    locate,
-    scene_of,
-    simulate,
-    simulate_robots,
-    twin_of,
-)
+from magtwin.twin import in_session_of, lab_and_map, locate, scene_of, simulate, simulate_robots, twin_of
 
 CAUSES: Mapping[str, str] = {
     "magtwin": "another version of magtwin",

@@ -97,10 +97,7 @@ class Listed:
                 Figure("took", round(took_s, 3), "s"),
                 Figure("rate", made / took_s, "runs/s"),
             ),
-            {
-                "paths": ", ".join(self.paths),
-                "sessions": "survey" if names == {"survey"} else sessions,
-            },
+            {"paths": ", ".join(self.paths), "sessions": "survey" if names == {"survey"} else sessions},
             self.tally.verdict(
                 f"the exact field of {runs} in {'one session' if sessions == 1 else f'{sessions} sessions'}",
                 holds=HOLDS_ONE if sessions == 1 else HOLDS,

@@ -15,6 +15,7 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from tokenize import TokenError
 from typing import IO, Any
@@ -25,9 +26,11 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, RepairWarning, find
+from magtwin.field.units import NT_PER, unit_by_size
 from magtwin.files.budget import BUDGETS, check_count, check_decoded, decoded_limit
 from magtwin.files.file import check_zip, existing, existing_file
 from magtwin.files.outputs import check_free, output
+from magtwin.report.summary import listed
 from magtwin.run import mapped
 from magtwin.run.arrow import (
     FACTS,
@@ -42,11 +45,12 @@ from magtwin.run.run import COLUMNS, Run, check_clock
 from magtwin.run.spool import Spool, blocks
 from magtwin.tables.parquet import load_parquet
 from magtwin.tables.quantities import QUANTITIES
-from magtwin.tables.table import Column, Table
+from magtwin.tables.table import Column, Table, read_table, since_1970
 
 _ABOUT = "magtwin"  # Name of the member of an npz with the metadata, and first word of a CSV
 
 _OWN = {("t",): ("t",), ("x", "y"): ("p_world_base_x", "p_world_base_y"), ("heading",): ("yaw",)}
+_OWN |= {("field",): ("b_measured_nt",)}
 """Columns of a Run that are known by the quantity that a table of another program names."""
 
 _BROKEN = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, RuntimeError, ValueError)
@@ -96,12 +100,13 @@ def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | N
     try:
         if path.is_dir():
             return _read_parts(path)
-        if load_parquet(path, pq.read_metadata).num_rows > mapped.LONG:
+        about = load_parquet(path, pq.read_metadata)
+        if about.num_rows > mapped.LONG:
             return _read_long(path, [path], columns)
+        if FACTS not in (about.metadata or {}):
+            return _others(path, columns)
         table = load_parquet(path)
-        if columns:
-            table = table.rename_columns(_renamed(table.column_names, columns, path))
-        return run_of(table if FACTS in (table.schema.metadata or {}) else _by_quantity(table, path), path)
+        return run_of(table.rename_columns(_renamed(table.column_names, columns or {}, path)), path)
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: damaged Parquet (a name is no text); write it again") from error
 
@@ -220,7 +225,10 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
     path = existing_file(path, "CSV file", "CSV")
     size = path.stat().st_size
     with open(path, "rb") as file:
-        about, names, skipped = _csv_head(file, path)
+        try:
+            about, names, skipped = _csv_head(file, path)
+        except InputError as error:
+            return _others(path, columns, error)
         file.seek(-1, os.SEEK_END)
         cut = file.read(1) != b"\n"
     check_count(path, "CSV", len(names), "columns")
@@ -254,8 +262,11 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
         )
         table = csv.read_csv(path, reading, csv.ParseOptions(), conversion)
     except (pa.ArrowException, OSError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: not a CSV file of a run: {_short(reason)}") from error
+        reason = _short(" ".join(str(error).split()))
+        fault = InputError(f"{path}: not a CSV file of a run: {reason}")
+        if not said:
+            return _others(path, columns, fault)
+        raise fault from error
     if rows not in ("", str(table.num_rows)):
         raise InputError(
             f"{path}: holds {table.num_rows} rows, but its line '# rows' says {rows[:20]!r}: cut short, or "
@@ -277,21 +288,66 @@ def _renamed(names: Sequence[str], columns: Mapping[str, str], path: Path) -> li
     return [own.get(name, name) for name in names]
 
 
+def _others(path: Path, columns: Mapping[str, str] | None, error: InputError | None = None) -> Run:
+    """The run in a table of another program, without its texts; if it is none, the error is raised."""
+    try:
+        table = read_table(path)
+    except InputError:
+        if error is None:
+            raise
+        raise error from None
+    if (twice := Counter(table.names).most_common(1)[0])[1] > 1:
+        raise InputError(f"{path}: two columns are called {twice[0]!r}; rename one")
+    kept, texts = dict[str, Any](), list[str]()
+    for name, column in zip(table.names, table.columns, strict=True):
+        if isinstance(column.cells, np.ndarray) and column.cells.dtype.kind in "fiub":
+            kept[name] = column.cells
+            continue
+        for read in (table.numbers, table.times):
+            with suppress(InputError):
+                kept[name] = read(name)
+                break
+        else:
+            texts.append(name)
+    names = _renamed([*kept], columns or {}, path)
+    if wrong := {*COLUMNS} & {*texts}:
+        raise error or InputError(f"{path}: column {min(wrong)!r} must hold numbers or flags, got texts")
+    run = run_of(_by_quantity(pa.table([pa.array(v) for v in kept.values()], names), path), path)
+    if notes := [*table.notes, *([f"without the texts in {listed(texts)}"] if texts else [])]:
+        warnings.warn(f"{path}: read {', '.join(notes)}", RepairWarning, stacklevel=4)
+    return run
+
+
 def _by_quantity(table: pa.Table, path: Path) -> pa.Table:
     """A table of another program, with the names and units of a Run for what it names otherwise."""
     notes = []
     for symbols, own in _OWN.items():
-        columns = Table(tuple(Column(name, (), path, None) for name in table.column_names))
+        free = (n for n in table.column_names if n not in COLUMNS and not _is_part(n))
+        columns = Table(tuple(Column(name, (), path, None) for name in free))
         labels = [] if set(own) & set(table.column_names) else columns.find(*symbols)
         for symbol, label, name in zip(symbols, labels, own, strict=False):
             k = table.column_names.index(label)
-            if pa.types.is_floating(table.schema.field(k).type):
-                factor = QUANTITIES[symbol].units.get(columns.unit(label, symbol), 1.0)
-                table = table.set_column(k, name, pa.array(factor * table.column(k).to_numpy()))
+            if pa.types.is_floating(kind := table.schema.field(k).type) or pa.types.is_integer(kind):
+                values = table.column(k).to_numpy()
+                factor = QUANTITIES[symbol].units.get(columns.unit(label, symbol))
+                if symbol == "t":
+                    values, factor = since_1970(Table((Column(label, values, path, None),)), label)[0], 1.0
+                elif factor is None:
+                    factor = NT_PER[unit_by_size(values) or "nT"] if symbol == "field" else 1.0
+                table = table.set_column(k, name, pa.array(factor * values))
                 notes.append(f"{label} as {name}")
+    if "t" not in table.column_names:
+        known = f"column 't' is missing (columns: {listed(table.column_names)})"
+        raise InputError(f"{path}: not a Run: {known}; if a survey, magtwin map import takes it")
     if notes:
         warnings.warn(f"{path}: read {', '.join(notes)}", RepairWarning, stacklevel=4)
     return _on_the_floor(table)
+
+
+def _is_part(name: str) -> bool:
+    """Whether a name is that of a part of a vector of a Run, such as `odom_p_x`."""
+    vector = COLUMNS.get(name.rpartition("_")[0])
+    return vector is not None and vector.width > 1
 
 
 def _on_the_floor(table: pa.Table) -> pa.Table:
@@ -321,9 +377,6 @@ def _csv_head(file: io.BufferedReader, path: Path) -> tuple[list[str], list[str]
                 )
             about.append(text)
         elif text.strip():
-            other = next((sign for sign in (";", "\t") if sign in text and "," not in text), None)
-            if other is not None:
-                raise InputError(f"{path}: columns are separated by {other!r}; save it with commas")
             return about, [name.strip().strip('"') for name in text.split(",")], count
     raise InputError(f"{path}: no line of column names; the file is empty, or cut short")
 

@@ -16,6 +16,7 @@ from magtwin.localization.bounds import Bounds
 from magtwin.localization.problem import Array
 from magtwin.localization.track import Track
 from magtwin.report.verdict import EVEN
+from magtwin.run.thinning import stretches
 
 Flags = NDArray[np.bool_]
 
@@ -290,20 +291,14 @@ def independent(values: Array) -> float:
 
 def _converged(t: Array, error: Array) -> int | None:
     """First row from which the error stays below `NEAR_M` for `HELD_S`."""
-    for begin, end in _stretches(error < NEAR_M):
+    for begin, end in stretches(error < NEAR_M).tolist():
         if t[end - 1] - t[begin] >= HELD_S - 1e-9:
             return begin
     return None
 
 
 def _stays(t: Array, flags: Flags, longer_s: float) -> bool:
-    return any(t[end - 1] - t[begin] > longer_s for begin, end in _stretches(flags))
-
-
-def _stretches(flags: Flags) -> list[tuple[int, int]]:
-    """First row, and row after the last, of each stretch of true flags."""
-    steps = np.diff(np.concatenate([[0], flags.astype(int), [0]]))
-    return list(zip(np.flatnonzero(steps == 1).tolist(), np.flatnonzero(steps == -1).tolist(), strict=True))
+    return any(t[end - 1] - t[begin] > longer_s for begin, end in stretches(flags))
 
 
 def _rms(values: Array) -> float:

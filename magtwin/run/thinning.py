@@ -1,4 +1,4 @@
-"""Thinning: rows of a recording at a lower rate, without losing readings to dropouts."""
+"""Thinning: stretches of a recording, and its rows at a lower rate without losing readings to dropouts."""
 
 from itertools import pairwise
 
@@ -16,12 +16,13 @@ def field_known(run: Run) -> NDArray[np.bool_]:
     return known & ~run["flag_lost_lock"] if "flag_lost_lock" in run else known
 
 
-def newest(ends: Rows, good: NDArray[np.bool_]) -> Rows:
-    """The newest good row of each stretch of rows; its last row if none is good.
+def stretches(flags: NDArray[np.bool_]) -> Rows:
+    """First row of each stretch in which a flag is set, and the one after its last, shape (K, 2)."""
+    return np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2)
 
-    Returns:
-        Shape (M,).
-    """
+
+def newest(ends: Rows, good: NDArray[np.bool_]) -> Rows:
+    """The newest good row of each stretch of rows, shape (M,); its last row if none is good."""
     latest = np.maximum.accumulate(np.where(good, np.arange(len(good)), -1))[ends]
     begins = np.concatenate([[0], ends[:-1] + 1])
     return np.where(latest >= begins, latest, ends)

@@ -58,17 +58,21 @@ def load_parquet(path: Path, load: Callable[[Path], Any] = _whole) -> Any:
 
 
 def parquet_columns(path: Path) -> list[tuple[str, NDArray[Any]]]:
-    """Name and cells of the columns of numbers, texts and timestamps, which are seconds since 1970."""
+    """Name and cells of the columns of numbers, texts and times, which are seconds, of dates since 1970."""
     table = load_parquet(path)
     columns = []
     for field, values in zip(table.schema, table.columns, strict=True):
         kind = field.type
         if pa.types.is_dictionary(kind):
             values, kind = values.cast(kind.value_type), kind.value_type
+        if pa.types.is_decimal(kind) or pa.types.is_date(kind):
+            kind = pa.float64() if pa.types.is_decimal(kind) else pa.timestamp("s")
+            values = values.cast(kind)
         if pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind):
             plain = values.cast(pa.float64(), safe=False) if values.null_count else values
             columns.append((field.name, plain.to_numpy()))
-        elif pa.types.is_timestamp(kind):
+        elif pa.types.is_timestamp(kind) or pa.types.is_duration(kind) or pa.types.is_time(kind):
+            values = values.cast(pa.int32()) if pa.types.is_time32(kind) else values
             since = values.cast(pa.int64()).cast(pa.float64(), safe=False)
             columns.append((field.name, since.to_numpy() / _TICKS[kind.unit]))
         elif pa.types.is_string(kind) or pa.types.is_large_string(kind):

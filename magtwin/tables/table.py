@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,12 @@ _CLOCK = re.compile(r"\d{1,3}(:\d\d){1,2}(\.\d*)?", re.ASCII)
 _DAYS = ("%Y-%m-%d", "%d-%m-%Y", "%m-%d-%Y", "%d-%b-%Y")  # Orders of a date, with a hyphen for any mark
 _CLOCKS = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")  # Times behind a date
 _READ = "2025-11-22T08:26:40"  # A date as an error message shows it
+
+
+_MELTED = (("variable", "name", "key", "quantity", "channel", "signal", "parameter"), ("value", "values"))
+"""Names of the columns of a table with a row for each value: of its quantity, and of the value."""
+
+MOST_MELTED = 100  # Most quantities of such a table
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,6 +230,29 @@ def since_1970(table: Table, name: str) -> tuple[Array, str]:
     return t, ""
 
 
+def _by_time(table: Table) -> Table:
+    """A table with a column for each quantity, of one with a column of values and one of their names."""
+    key, value = ([c for c in table.columns if c.name.strip().lower() in words] for words in _MELTED)
+    if len(key) != 1 or len(value) != 1 or table.columns[0] in (*key, *value):
+        return table
+    rest = [column for column in table.columns if column not in (*key, *value)]
+    rows, again, at = dict[Any, int](), dict[Any, int](), list[int]()
+    for name, *cells in zip(key[0].cells, *(column.cells for column in rest), strict=True):
+        again[name, *cells] = count = again.get((name, *cells), -1) + 1
+        at.append(rows.setdefault((count, *cells), len(rows)))
+    names, first = np.array(key[0].cells, object), np.unique(at, return_index=True)[1].tolist()
+    lines = None if value[0].lines is None else [value[0].lines[row] for row in first]
+    columns = [replace(c, cells=np.asarray(c.cells)[first].astype(str).tolist(), lines=lines) for c in rest]
+    for name in dict.fromkeys(key[0].cells):
+        texts = np.full(len(rows), "nan", object)
+        texts[np.array(at)[names == name]] = np.asarray(value[0].cells)[names == name].astype(str)
+        columns.append(Column(str(name), texts.tolist(), table.path, lines))
+    own, others = ([c.name for c in part] for part in (columns[: len(rest)], columns[len(rest) :]))
+    wide = Table(tuple(columns), (*table.notes, f"{key[0].name} as {listed(others)}, by {_and(own)}"))
+    known = any(wide.find(*some) for some in (("x", "y"), ("field",), ("bx", "by", "bz")))
+    return replace(wide, comments=table.comments) if known and len(others) <= MOST_MELTED else table
+
+
 def _and(names: Sequence[str]) -> str:
     """Names in a line: `t, v and w`."""
     return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)[: 3 * QUOTED]
@@ -282,7 +311,9 @@ def read_table(
         from magtwin.tables.parquet import parquet_columns  # imports pyarrow
 
         path = existing(path, noun)
-        return Table(tuple(Column(name, cells, path, None) for name, cells in parquet_columns(path)))
+        return _by_time(
+            Table(tuple(Column(name, cells, path, None) for name, cells in parquet_columns(path)))
+        )
     if content is None and Path(path).suffix.lower() in SPREADSHEETS:
         from magtwin.tables.spreadsheet import text_of_spreadsheet
 
@@ -291,4 +322,4 @@ def read_table(
     names = text.names or ("",) * len(text.rows[0])
     pairs = zip(names, zip(*text.rows, strict=True), strict=True)
     columns = tuple(Column(name, list(cells), text.path, text.lines) for name, cells in pairs)
-    return Table(columns, text.notes, text.comments)
+    return _by_time(Table(columns, text.notes, text.comments))

@@ -7,12 +7,16 @@ import struct
 import zipfile
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from numpy.testing import assert_allclose
 
 from magtwin.errors import InputError
 from magtwin.field.survey.readings import taken_of
+from magtwin.io.formats import read_run
 from magtwin.io.info import info_of
+from magtwin.io.surveys.columns import Columns
 from magtwin.io.surveys.doctor import examine
 from magtwin.io.surveys.maps import import_survey
 from magtwin.io.surveys.places import on_tangent_plane
@@ -321,6 +325,44 @@ def test_a_trajectory_of_euroc_is_a_path(tmp_path):
         assert_allclose(read_path_csv(tmp_path / "a.csv").p_xy, CORNERS)
 
 
+@pytest.mark.parametrize("step_m", [None, 0.5])
+def test_marks_without_times_are_passed_at_a_steady_pace_or_by_steps(tmp_path, step_m):
+    t, p, b, marks = walk(rate=50.0)
+    folder = sensor_logger(tmp_path / "a", t, b, marks)
+    (folder / "Annotation.csv").unlink()
+    falls = 9.81 + 5 * np.clip(np.sin(2 * np.pi * t), -0.6, 1)  # one step a second, at 0.5 m/s
+    rows = [
+        [START_NS + round(s * 1e9), s, a, 0.0, 0.0] for s, a in zip(t.tolist(), falls.tolist(), strict=True)
+    ]
+    (folder / "Accelerometer.csv").write_text(text(["time", "seconds_elapsed", "z", "y", "x"], rows))
+    (tmp_path / "marks.csv").write_text(text(["x", "y"], number(CORNERS)))
+    readings = read_readings(folder, waypoints=tmp_path / "marks.csv", step_m=step_m)
+    at = np.column_stack([np.interp(readings.t - readings.t[0], t, part) for part in p.T])
+    assert len(readings) > 0.95 * len(t)
+    assert np.linalg.norm(readings.p_xy - at, axis=1).max() < (0.05 if step_m is None else 1.0)
+    assert any("steps of 0.5 m" in note for note in taken_of(readings)) == (step_m is not None)
+    with pytest.raises(InputError, match="drop --step-m"):
+        read_readings(folder, waypoints=tmp_path / "marks.csv", step_m=-1.0)
+
+
+@pytest.mark.filterwarnings("ignore:.* read :magtwin.errors.RepairWarning")
+@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
+def test_a_row_for_each_value_and_whole_numbers_are_read(tmp_path, suffix):
+    t, file = np.arange(150), tmp_path / f"a{suffix}"
+    x, b = t // 10, 48_000 + t
+    names, cells = np.tile(["x", "y", "field"], len(t)), np.stack([x, 2 * x + t % 2, b], axis=1).ravel()
+    if suffix == ".csv":
+        rows = zip(np.repeat(t, 3).tolist(), names.tolist(), cells.tolist(), strict=True)
+        file.write_text(text(["time", "variable", "value"], rows))
+    else:
+        pq.write_table(pa.table({"time": np.repeat(t, 3), "variable": names, "value": cells}), file)
+    readings, run = read_readings(file), read_run(file)
+    assert_allclose(readings.b_nt, b)
+    assert_allclose(readings.p_xy, np.column_stack([x, 2 * x + t % 2]))
+    assert_allclose(run["p_world_base"][:, :2], readings.p_xy)
+    assert_allclose(run["b_measured_nt"], b)
+
+
 REFUSED = [
     ("t,bx,by,bz\n0,1,2,40\n1,1,2,40\n", "t,x,y\n100,0,0\n200,1,1\n", "have no time in common"),
     ("t,bx,by,bz\n0,1,2,40\n1,1,2,40\n", "t,x,y\n0,0,0\n", "1 mark; a walk needs two"),
@@ -379,6 +421,18 @@ def test_info_of_a_log_says_what_it_is_fit_for_and_what_to_type(tmp_path):
     report = info_of(source)
     assert report.metadata["fit for a map"].startswith("no, because it has no pose")
     assert report.metadata["next"].endswith("--waypoints MARKS.csv")
+    assert info_of(source, waypoints=waypoints).metadata["fit for a map"] == "yes"
+    told = info_of(source, columns=Columns(unit="nT"))
+    assert "--unit nT --waypoints" in told.metadata["next"]
+    assert next(f.value for f in told.figures if f.name == "range") == "45 to 46"
+    holes = source.read_text().splitlines()
+    source.write_text(
+        "\n".join(line.rpartition(",")[0] + "," if k % 10 == 3 else line for k, line in enumerate(holes))
+    )
+    values = {f.name: f.value for f in info_of(source, waypoints=waypoints).figures}
+    assert values["finite readings"] == pytest.approx(90, abs=0.5)
+    with pytest.raises(InputError, match="no bag; drop --field-topic"):
+        info_of(source, topics={"/robot/enu/pose": "/a"})
     waypoints.unlink()
     folder = sensor_logger(tmp_path / "b", t, b, marks)
     assert info_of(folder).metadata["fit for a map"] == "yes"

@@ -124,6 +124,22 @@ def test_a_field_of_a_type_that_only_the_bag_defines_is_read(tmp_path, kind, ver
     assert_array_equal(run["t"], np.arange(50))
 
 
+@pytest.mark.parametrize(("size", "numbers"), product((32, 64), (1, 2, 3)))
+def test_an_array_of_numbers_is_a_field_by_its_role(tmp_path, size, numbers):
+    kind, b = f"std_msgs/msg/Float{size}MultiArray", [FIELD[:numbers], np.linalg.norm(FIELD)][numbers == 1]
+    dims = {"layout.dim": 1, "layout.dim.0.label": "xyz", "layout.dim.0.size": np.uint32(numbers)}
+    rows = [(t, kind, {**dims, "data": np.reshape(b, (1, -1))}) for t in T]
+    bag = record(tmp_path / "a.mcap", {"/magnetometer": rows, "/truth": poses()})
+    if numbers == 2:
+        with pytest.raises(InputError, match="has 2 numbers; a magnitude is one, a vector x, y, z"):
+            read_bag(bag)
+        return
+    run = read_bag(bag)
+    assert_allclose(run["b_measured_nt"], np.linalg.norm(FIELD), rtol=1e-6)
+    if numbers == 3:
+        assert_allclose(run["b_vector_measured_nt"], np.tile(FIELD, (200, 1)), rtol=1e-6)
+
+
 def test_a_bag_of_ros_1_is_read_like_that_of_ros_2(tmp_path):
     store = get_typestore(Stores.ROS1_NOETIC)
     types, kind = store.types, "sensor_msgs/msg/MagneticField"
@@ -220,10 +236,15 @@ def test_each_option_in_a_message_is_one_of_the_commands_that_read_recordings(ca
     }
     assert {"--field-topic", "--pose-topic", "--remap", "--unit", "--scale"} == words
     names = "info,view,convert,report,compare,plot,evaluate,localize,model calibrate,dataset build,ros replay"
-    for name in names.split(","):
+    rooms = [root.parent / "surveys", root.parents[1] / "tables"]
+    told = "".join(path.read_text() for room in rooms for path in room.glob("*.py"))
+    others = {"--out", "--keep-stuck", "--created", "--map", "--method"}
+    told = set(re.findall(r"(?<!-)--[a-z]+[a-z-]*", told)) - others
+    for name in [*names.split(","), "map import"]:
         main([*name.split(), "--help"])
         shown = capsys.readouterr().out
-        assert all(word in shown for word in words), name
+        wanted = told if name == "map import" else words | (told if name == "info" else set())
+        assert all(word in shown for word in wanted), name
 
 
 def test_a_bag_numbers_its_messages_and_keeps_times_before_0_and_of_one_nanosecond(tmp_path):

@@ -26,11 +26,13 @@ KeepStuck = Annotated[Flag, Parameter(help="Keep readings of a sensor that was s
 class Reading:
     """How the files of a survey are read."""
 
-    keep_stuck: KeepStuck = False
-
     waypoints: Path | None = None
     """Table of t,x,y, or of t and notes such as "1.5,2": when the sensor was carried past which places [m].
-    For the log of a phone, which has no positions."""
+    For the log of a phone, which has no positions. Or of x,y alone, in the order of the walk."""
+
+    step_m: float | None = None
+    """Length of a step [m], for waypoints without times in a log with accelerations. Default: a steady pace
+    from the first to the last."""
 
     pose_topic: str | None = None
     """Topic of the poses in a bag, if it has several."""
@@ -58,7 +60,7 @@ def _as_imported(sources: Sequence[Path]) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        text = error.in_flags({k: flag for k, flag in _TOLD.items() if k != "keep_stuck"})
+        text = error.in_flags(_TOLD)
         advice = _ADVICE.search(text)
         if advice is None:
             raise
@@ -74,6 +76,7 @@ def map_import(
     out: Path | None = None,
     about: AboutSurvey = ABOUT,
     reading: ReadingOptions = READING,
+    keep_stuck: KeepStuck = False,
     force: Force = False,
 ) -> Done:
     """Import a survey as a map layer, or as a file of readings.
@@ -97,7 +100,8 @@ def map_import(
     out = out or Path(f"{Path(sources[0]).stem}.usdc")
     out = named(out, (*LAYERS, ".parquet"), READINGS, force=force)
     with progress("Reading the survey") as advance:
-        report = import_survey(sources, out, about=about, progress=advance, force=force, **vars(reading))
+        how: Any = {"keep_stuck": keep_stuck, "force": force, **vars(reading)}
+        report = import_survey(sources, out, about=about, progress=advance, **how)
     return _done(report, out)
 
 

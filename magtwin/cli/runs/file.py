@@ -7,11 +7,12 @@ from cyclopts import Parameter
 
 from magtwin.cli import options as opt
 from magtwin.cli.app import app
+from magtwin.cli.maps.fit import READING, ReadingOptions
 from magtwin.cli.terminal import Done, named, progress, silence, step
 
 
 @app.command
-def info(file: Path, *, recorded: opt.RecordedOptions = opt.RECORDED) -> Done:
+def info(file: Path, *, reading: ReadingOptions = READING, remap: opt.Remap = None) -> Done:
     """Print what a run, a stage, a map or a network holds, and its origin.
 
     Parameters
@@ -25,7 +26,11 @@ def info(file: Path, *, recorded: opt.RecordedOptions = opt.RECORDED) -> Done:
     from magtwin.io.info import info_of
 
     step(f"Reading {file.name}")
-    return Done(info_of(file, **recorded.options), whole=True)
+    told = {name: getattr(reading.columns, name) for name in ("unit", "scale")}
+    told |= {name: getattr(reading, name) for name in ("field_topic", "pose_topic")}
+    how = opt.Recorded(remap=remap, **told).options
+    how |= {name: getattr(reading, name) for name in ("columns", "waypoints", "step_m")}
+    return Done(info_of(file, **how), whole=True)
 
 
 @app.command

@@ -93,7 +93,8 @@ class Stream:
             if topic.needs:
                 rows = self._rows(topic, run, t)
                 names = dict.fromkeys((*topic.needs, *topic.by, "wheel_angle", "odom_v", "b_sd_nt"))
-                for part in _alike(run, topic.by, rows):
+                for some in _alike(run, topic.by, rows):
+                    part: Any = slice(None) if len(some) == len(t) else some
                     chosen = {name: run[name][part] for name in names if name in run}
                     yield topic, stamps[part], topic.write(chosen, stamps[part], self._sender)
         data = np.column_stack([np.asarray(run[name], float) for name in self._rest])

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from magtwin.errors import InputError
 from magtwin.frames import enu_from_ned, quat_conjugate, quat_multiply, rotate
 from magtwin.io.bags.sender import Sender
 
@@ -298,8 +299,19 @@ def _of_ned(columns: dict[str, Array], name: str = "odom") -> dict[str, Array]:
     return {f"{name}_p": p, f"{name}_q_xyzw": enu_from_ned(q_ned_frd)} | turned
 
 
+def _of_array(columns: dict[str, Array]) -> dict[str, Array]:
+    """Vectors of three numbers, or magnitudes, of messages that hold any number of numbers."""
+    for name, values in columns.items():
+        if values.shape[1] not in (1, 3):
+            raise InputError(
+                f"its {name} has {values.shape[1]} numbers; a magnitude is one, a vector x, y, z"
+            )
+    return {name: values if values.shape[1] == 3 else values[:, 0] for name, values in columns.items()}
+
+
 _PX4 = "px4_msgs/msg/"
 _FIELD = "sensor_msgs/msg/MagneticField"
+_ARRAYS = {f"std_msgs/msg/Float{size}MultiArray": {"magnetic_field": "data"} for size in (64, 32)}
 
 POSE = Topic(
     name="/robot/enu/pose",
@@ -369,10 +381,12 @@ MAGNITUDE = Topic(
         "geometry_msgs/msg/Vector3": {"magnetic_field": ("x", "y", "z")},
         "std_msgs/msg/Float64": {"magnetic_field": "data"},
         "std_msgs/msg/Float32": {"magnetic_field": "data"},
+        **_ARRAYS,
         _PX4 + "VehicleMagnetometer": {"magnetic_field": "magnetometer_ga"},
         _PX4 + "SensorMag": {"magnetic_field": ("x", "y", "z")},
     },
-    turned=dict.fromkeys((_PX4 + "VehicleMagnetometer", _PX4 + "SensorMag"), _of_frd),
+    turned=dict.fromkeys((_PX4 + "VehicleMagnetometer", _PX4 + "SensorMag"), _of_frd)
+    | dict.fromkeys(_ARRAYS, _of_array),
 )
 VECTOR = Topic(
     name="/robot/qtfm/field",
@@ -385,7 +399,9 @@ VECTOR = Topic(
     reads={
         _FIELD: {"magnetic_field": "magnetic_field"},
         "geometry_msgs/msg/Vector3Stamped": {"magnetic_field": "vector"},
+        **_ARRAYS,
     },
+    turned=dict.fromkeys(_ARRAYS, _of_array),
 )
 COMMAND = Topic(
     name="/robot/cmd_vel",

@@ -85,7 +85,7 @@ def _field(bag: Bag, most: int | None, reading: Mapping[str, Any]) -> tuple[Repo
         warnings.simplefilter("always")
         try:
             recording = Recording(bag, topics, most=most)
-            recording.read(reading.get("unit"), reading.get("scale"))
+            recording.read(reading.get("unit"), reading.get("scale"), summed=False)
         except InputError as error:
             fault = str(error).removeprefix(f"{bag.path}: ")
         except Exception as error:

@@ -52,7 +52,7 @@ ROLES: Mapping[Topic, Role] = {
         kinds=(MAGNITUDE.kind, "px4_msgs/msg/VehicleMagnetometer", "px4_msgs/msg/SensorMag"),
         named="mag compass field bfield b_field tesla gauss qtfm fluxgate",
         never="bias offset covariance calib heading hdg temp status std error gain declination image "
-        "sensitivity gyro accel acceleration velocity force",
+        "sensitivity gyro accel acceleration velocity force magtwin",
         ranks=("magnitude total scalar", "*", "raw uncal"),
         option="--field-topic",
         vectors=("magnetic_field",),

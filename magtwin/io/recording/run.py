@@ -35,7 +35,7 @@ from magtwin.io.recording.roles import (
     role_of,
 )
 from magtwin.io.recording.signal import Signal, read_signal
-from magtwin.io.recording.tree import Tree
+from magtwin.io.recording.tree import Tree, topics_of_frames
 from magtwin.io.recording.unit import field_nt, unit_of
 from magtwin.run.run import COLUMNS, Run
 
@@ -90,6 +90,8 @@ class Recording:
         """Find the roles; `most` are the bytes of the beginning that are read, None for all of the bag."""
         self._bag, self._names, self._survey, self._most = bag, names, survey, most
         self._columns: Columns = {}
+        self._signals: dict[str, Signal] = {}
+        self._known: dict[str, Frames] = {}
         self._read: set[str] = set()
         self._frameless: dict[str, list[str]] = {}
         self._by_tf = names.get(POSE.name) == TRANSFORMS
@@ -104,10 +106,10 @@ class Recording:
     @cached_property
     def tree(self) -> Tree:
         """The frames of the robot."""
-        return Tree(self._bag, self._most)
+        return Tree(self._bag, self._messages)
 
-    def read(self, unit: Unit | None, scale: float | None) -> None:
-        """Read all roles."""
+    def read(self, unit: Unit | None, scale: float | None, *, summed: bool = True) -> None:
+        """Read all roles; `summed` puts the checksum of the bag into the metadata."""
         check_factor(unit, scale)
         self._told = unit is not None or scale is not None
         self._unit, self._scale = unit, scale
@@ -116,7 +118,8 @@ class Recording:
         if not self._survey:
             self._read_rest()
         metadata = self._metadata
-        metadata["bag_sha256"] = " ".join(sha256(file) for file in self._bag.files)
+        if summed:
+            metadata["bag_sha256"] = " ".join(sha256(file) for file in self._bag.files)
         metadata["topics"] = " ".join(sorted(self._read))
         if self.timeline:
             metadata["timeline"] = "; ".join(f"{name}: {text}" for name, text in self.timeline.items())
@@ -287,7 +290,7 @@ class Recording:
             check_kind(topic, bag, name)
         fitting = {t: [told[t]] if t in told else candidates(t, bag, told.values()) for t in roles}
         fitting[POSE] = [] if self._by_tf else fitting[POSE]
-        messages = bag.messages(chain(*fitting.values()), self._most)
+        messages = bag.messages(chain(*fitting.values(), topics_of_frames(bag)), self._most)
         found: dict[Topic, str] = {}
         notes: dict[str, list[str]] = {"its type": [], "its name": []}
         for topic, several in fitting.items():
@@ -353,19 +356,22 @@ class Recording:
         )
 
     def _signal(self, topic: Topic) -> Signal:
-        name = self._topics[topic]
-        signal = read_signal(self._bag, name, topic, self._messages[name])
-        if signal.broken:
-            self._order(signal, f"{signal.broken} damaged left out")
-        self.frames[ROLES[topic].noun] = self._frames(signal)
-        return signal
+        name, noun = self._topics[topic], ROLES[topic].noun
+        if noun not in self._signals:
+            signal = read_signal(self._bag, name, topic, self._messages[name])
+            if signal.broken:
+                self._order(signal, f"{signal.broken} damaged left out")
+            self._signals[noun], self.frames[noun] = signal, self._frames(signal)
+        return self._signals[noun]
 
     def _frames(self, signal: Signal) -> Frames:
         """The frames of a signal."""
-        try:
-            return frames_of(self._bag.layout(signal.name), signal.messages)
-        except InputError as error:
-            raise InputError(f"{self._bag.path}: topic {signal.name}: {error}") from error
+        if signal.name not in self._known:
+            try:
+                self._known[signal.name] = frames_of(self._bag.layout(signal.name), signal.messages)
+            except InputError as error:
+                raise InputError(f"{self._bag.path}: topic {signal.name}: {error}") from error
+        return self._known[signal.name]
 
     def _order(self, signal: Signal, text: str) -> None:
         """Note what was done to put a topic in order."""

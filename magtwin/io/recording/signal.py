@@ -56,7 +56,7 @@ class Signal(NamedTuple):
 
 def read_signal(bag: Bag, name: str, topic: Topic, messages: Messages) -> Signal:
     """The messages of a topic of a bag, decoded for a role. A few that cannot be decoded are left out."""
-    topic, leaves = reads_of(topic, bag, name), bag.layout(name)
+    topic, leaves = reads_of(topic, bag, name), _layout(bag, name, messages)
     known = {leaf.name: leaf.kind for leaf in leaves}
     stamp = next((leaf for leaf in STAMPS if known.get(leaf) in ("time", "u8")), None)
     wanted = [*topic.leaves(bag.kinds[name]), *([stamp] if stamp else [])]
@@ -74,6 +74,15 @@ def read_signal(bag: Bag, name: str, topic: Topic, messages: Messages) -> Signal
     if stamps is not None and np.count_nonzero(stamps == 0) > max(1, WRONG * len(stamps)):
         stamps = None
     return Signal(name, topic, bag.kinds[name], messages, fields, stamps, broken)
+
+
+def _layout(bag: Bag, name: str, messages: Messages) -> tuple[Leaf, ...]:
+    """The leaves of a topic's messages, which may begin with structures, as the dimensions of an array."""
+    leaves = bag.layout(name)
+    if leaves[0].kind != "none" or not len(messages):
+        return leaves
+    first, rows = leaves[0].name, np.zeros(1, np.intp)
+    return bag.layout(name, {first: decode([Leaf(first, "u4")], messages.take(rows), [first])[first][0]})
 
 
 def _decodable(leaves: tuple[Leaf, ...], messages: Messages, wanted: list[str]) -> NDArray[np.intp]:

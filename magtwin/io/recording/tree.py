@@ -1,5 +1,6 @@
 """Tree: the frames of a recording, by /tf, /tf_static and the robot's description."""
 
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.frames import IDENTITY_XYZW, quat_multiply, rotate
 from magtwin.io.bags.bag import Bag
-from magtwin.io.bags.cdr import NS, Index, decode
+from magtwin.io.bags.cdr import NS, Index, Messages, decode
 from magtwin.io.bags.topics import DESCRIPTION, TF, TF_STATIC
 from magtwin.io.recording.frames import StaticFrames, Transform, kind_of, plain, transforms
 from magtwin.io.recording.poses import poses_at
@@ -20,29 +21,34 @@ STILL = 1e-9  # Largest change of a transform on /tf that does not move [m] and 
 MOST_DESCRIPTION = 4_000_000  # Longest description that is read [characters]
 
 
+def topics_of_frames(bag: Bag) -> list[str]:
+    """The topics of a bag that tell of frames."""
+    ends = {TF.name: TF.kind, TF_STATIC.name: TF.kind, "robot_description": DESCRIPTION.kind}
+    return [
+        name for name, kind in bag.kinds.items() if any(name.endswith(e) and kind == ends[e] for e in ends)
+    ]
+
+
 class Tree:
-    """The frames of a bag.
+    """The frames of a bag, by the messages of `topics_of_frames`.
 
     Attributes:
         static: Transforms that do not change; also those of /tf that never do.
         moving: By frame: its parent, the stamps [ns], and its origin and axes (xyzw) there, shape (M, 7).
     """
 
-    def __init__(self, bag: Bag, most: int | None = None) -> None:
+    def __init__(self, bag: Bag, messages: Mapping[str, Messages]) -> None:
         self.static = StaticFrames()
         self.moving: dict[str, tuple[str, Index, Array]] = {}
-        ends = {TF.name: TF.kind, TF_STATIC.name: TF.kind, "robot_description": DESCRIPTION.kind}
-        pairs = [(name, end) for name in bag.kinds for end in ends if name.endswith(end)]
-        names = {name: end for name, end in pairs if bag.kinds[name] == ends[end]}
         edges: dict[tuple[str, str], list[tuple[Index, Array]]] = {}
         with np.errstate(over="ignore", invalid="ignore"):
-            for name, messages in bag.messages(names, most).items():
+            for name in topics_of_frames(bag):
                 with suppress(InputError):
-                    if names[name] not in (TF.name, TF_STATIC.name):
-                        for text in decode(bag.layout(name), messages, ["data"])["data"][-1:]:
+                    if bag.kinds[name] != TF.kind:
+                        for text in decode(bag.layout(name), messages[name], ["data"])["data"][-1:]:
                             self.static.describe(text[:MOST_DESCRIPTION])
                         continue
-                    for each in transforms(messages, partial(bag.layout, name)):
+                    for each in transforms(messages[name], partial(bag.layout, name)):
                         if name.endswith(TF_STATIC.name):
                             for row in zip(each.parents, each.children, each.p, each.q_xyzw, strict=True):
                                 self.static.add(*row)

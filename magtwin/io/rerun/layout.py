@@ -145,11 +145,7 @@ def plotted(run: Run) -> bool:
 
 
 def layout(
-    run: Run,
-    lab: LabSpec | None = None,
-    *,
-    heading: float = 0.0,
-    events: Sequence[str] | None = None,
+    run: Run, lab: LabSpec | None = None, *, heading: float = 0.0, events: Sequence[str] | None = None
 ) -> rrb.Blueprint:
     """The views of a run: plots, states and events, and with a lab also the lab and the robot in 3D.
 

@@ -105,7 +105,7 @@ def _series(
     if bound_m is not None:
         position["position/bound"] = ("bound, 1 sigma", BOUND, 2.0, bound_m)
     offset: dict[str, Line] = {
-        "offset/estimate": ("offset of the magnetometer", ESTIMATE, 2.0, run["est_bias_nt"]),
+        "offset/estimate": ("offset of the magnetometer", ESTIMATE, 2.0, run["est_bias_nt"])
     }
     lost: dict[str, Line] = {"lost/flag": ("flagged lost", DEAD, 2.0, run["est_lost"].astype(float))}
     plots = {"Position error [m]": position, "Heading error [deg]": heading, "Offset [nT]": offset}

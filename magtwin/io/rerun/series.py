@@ -22,6 +22,7 @@ from magtwin.report.verdict import Z_90
 from magtwin.run.arrow import check_metadata, said_of, spec_said
 from magtwin.run.figures import prediction_nt
 from magtwin.run.run import COLUMNS, Run, check_numbers
+from magtwin.run.thinning import stretches
 
 Array = NDArray[np.float64]
 
@@ -268,9 +269,7 @@ class Flags:
     def _episodes(self, column: str, run: Run) -> Iterator[tuple[float, str, str]]:
         """Starts and ends of the events of a flag."""
         flag, t = run[column], run["t"]
-        edges = np.diff(flag.astype(np.int8), prepend=0, append=0)
-        begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-        for first, last in zip(begins, ends, strict=True):
+        for first, last in stretches(flag.astype(bool)) - [0, 1]:
             since = float(t[first])
             if column in self._open and since - self._open[column][1] > GAP_S:
                 yield self._end(column)

@@ -2,7 +2,7 @@
 
 import shlex
 from collections.abc import Collection
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -24,11 +24,7 @@ SECTORS = 12  # Sectors of 30 degrees in which headings are counted
 LEAST_READINGS, LEAST_SPAN_M = 100, 0.5  # Fewest readings and least extent [m] of a map
 LEAST_SECTORS = 6  # Fewest sectors for the hard iron, and for a robot's own field
 
-USES = {
-    "map": ("pose",),
-    "training": ("pose", "odometry", "imu", "battery"),
-    "localization": ("odometry",),
-}
+USES = {"map": ("pose",), "training": ("pose", "odometry", "imu", "battery"), "localization": ("odometry",)}
 """Roles beside the field that each use needs."""
 
 
@@ -58,6 +54,8 @@ def examine(
             raise ValueError("examine needs magnitudes or vectors")
         b_nt = np.linalg.norm(vector_nt, axis=1)
     known = np.isfinite(b_nt)
+    known &= True if t is None else np.isfinite(t)
+    known &= True if vector_nt is None else np.isfinite(vector_nt).all(axis=1)
     share = round(100 * float(known.mean()), 1) if len(b_nt) else 0.0
     figures = [Figure("field in", unit), Figure("finite readings", share, "%", note=f"of {len(b_nt):,}")]
     b, (vector, clock, p, angle) = (
@@ -84,32 +82,39 @@ def examine(
     return Report("field", tuple(figures), metadata | ({"doubts": doubts} if doubts else {}))
 
 
-def info_of_survey(file: Path) -> Report:
-    """What the field in a table or a log is like, what it is fit for, and the command to type next."""
-    from magtwin.io.surveys.logs import table_of_log
-    from magtwin.io.surveys.tabled import field_of_table, readings_of_table
+def info_of_survey(file: Path, told: Columns, waypoints: Path | None, step_m: float | None) -> Report:
+    """What the field in a table or a log is like, what it is fit for, and the command to type next.
 
-    table = table_of_log(file)
-    vector, b, t, unit = field_of_table(table)
+    `told` are columns and units that the user knows, and `waypoints` the table of a walk's marks,
+    with the length of a step [m].
+    """
+    from magtwin.io.surveys.logs import table_of_log
+    from magtwin.io.surveys.tabled import field_of_table, rows_of_table
+
+    table = table_of_log(file, waypoints, step_m)
+    vector, b, t, unit = field_of_table(table, told)
+    options = {
+        name: value
+        for name, value in {"waypoints": waypoints, "step_m": step_m, **asdict(told)}.items()
+        if value
+    }
+    flags = [word for name, value in options.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+    then = shlex.join([str(file), *flags])
     roles = [role for role, symbols in (("odometry", ("v", "w")),) if table.find(*symbols)]
     try:
-        readings = readings_of_table(table, Columns(), file.stem, file.name)
+        readings, rows = rows_of_table(table, told, file.stem, file.name)
     except InputError as error:
         report = examine(b, vector_nt=vector, t=t, roles=roles, unit=unit)
         more: dict[str, object] = {"no survey yet": str(error).removeprefix(f"{table.path}: ")}
-        then = f"{shlex.quote(str(file))} --waypoints MARKS.csv" if "--waypoints" in str(error) else ""
+        then = f"{then} --waypoints MARKS.csv" if "--waypoints" in str(error) else ""
     else:
+        b[rows] = readings.b_nt
+        p, yaw = np.full((len(b), 2), np.nan), np.full(len(b), np.nan)
+        p[rows], yaw[rows] = readings.p_xy, readings.yaw
         report = examine(
-            readings.b_nt,
-            vector_nt=vector if vector is not None and len(vector) == len(readings) else None,
-            t=readings.t,
-            p_xy=readings.p_xy,
-            yaw=None if readings.by_hand else readings.yaw,
-            roles=roles,
-            unit=unit,
+            b, vector_nt=vector, t=t, p_xy=p, yaw=None if readings.by_hand else yaw, roles=roles, unit=unit
         )
         more = {"taken": taken} if (taken := taken_of(readings)) else {}
-        then = shlex.quote(str(file))
     more |= {"next": f"magtwin map import {then}"} if then else {}
     facts = (Figure("columns", ", ".join(table.names)),)
     return replace(report, title=str(file), figures=facts + report.figures, metadata=report.metadata | more)

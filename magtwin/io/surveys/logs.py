@@ -55,8 +55,9 @@ def is_survey(path: Path) -> bool:
     return kind_of(path) in (None, ARCHIVE) and is_log(path)
 
 
-def table_of_log(path: Path, waypoints: Path | None = None) -> Table:
-    """The readings of a log, with their places, by a table of marks `waypoints` if the log has none.
+def table_of_log(path: Path, waypoints: Path | None = None, step_m: float | None = None) -> Table:
+    """The readings of a log, with their places, by a table of marks `waypoints` if the log has none,
+    and the length of a step [m] if these have no times.
 
     A log is a table; a folder or a zip of tables, as phyphox and Sensor Logger write them; a trace of an
     Android phone; or a log of a vehicle: PX4 (.ulg), ArduPilot (.bin) or HDF5.
@@ -67,11 +68,13 @@ def table_of_log(path: Path, waypoints: Path | None = None) -> Table:
     else:
         name, field = path.stem, read_table(path)
         parts = {name: field}
-    marks = marks_of(read_table(waypoints)) if waypoints else _marks(parts, name)
+    marks = marks_of(read_table(waypoints), timed=False) if waypoints else _marks(parts, name)
     if waypoints and marks is None:
-        raise InputError(f"{waypoints}: no marks; a row is t,x,y, or t and a note such as 1.5,2")
+        raise InputError(
+            f"{waypoints}: no marks; a row is t,x,y, or t and a note such as 1.5,2, or x,y in order"
+        )
     if marks:
-        return walked(field, marks, _accelerations(parts))
+        return walked(field, marks, _accelerations(parts), step_m)
     if labels := field.find("x", "y") or field.find("lon", "lat"):
         return _filled(field, [*labels, *field.find("heading")])
     for other in (part for key, part in parts.items() if key != name):

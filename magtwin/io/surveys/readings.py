@@ -38,6 +38,7 @@ def read_readings(
     pose_topic: str | None = None,
     field_topic: str | None = None,
     waypoints: Source | None = None,
+    step_m: float | None = None,
     **about: Any,
 ) -> Readings:
     """Read the readings of a survey from any supported source.
@@ -56,7 +57,8 @@ def read_readings(
         pose_topic: Topic of a bag's poses, if there are several.
         field_topic: Topic of a bag's field, if there are several.
         waypoints: Table of t,x,y, the times at which the sensor was carried past places, for a log without
-            positions (`magtwin.io.surveys.walk`).
+            positions (`magtwin.io.surveys.walk`); or of x,y in the order of the walk.
+        step_m: Length of a step [m], for waypoints without times and a log with accelerations.
         about: Metadata that replace those of the sources, unless None or "": `name`, `licence`, `created`,
             `height_m` [m], `frame` and `datum`, as in `magtwin.io.surveys.columns.About`.
 
@@ -79,7 +81,7 @@ def read_readings(
             twice.append(f"{source} and {same} as one, since their bytes are equal")
             continue
         named = {k: name for k, name in topics.items() if name}
-        parts.append(_part(source, columns, headings_deg, named, waypoints))
+        parts.append(_part(source, columns, headings_deg, named, waypoints, step_m))
     readings = parts[0] if len(parts) == 1 else _together(parts)
     if twice:
         readings = readings.with_(source="; ".join([readings.source, *(TAKEN + text for text in twice)]))
@@ -164,6 +166,7 @@ def _part(
     headings_deg: tuple[float, ...] | None,
     topics: dict[str, str],
     waypoints: Source | None,
+    step_m: float | None,
 ) -> Readings:
     """The readings of one source, by the kind of its file."""
     path = _first(source)
@@ -173,7 +176,7 @@ def _part(
     if path != Path(source) or kind not in (RUN, READINGS, SURVEY):
         paths = [path, *(_beside(path, word) for word in str(source).split("+")[1:] if path != Path(source))]
         marks = None if waypoints is None else existing(waypoints, "table of waypoints")
-        table = table_of_log(path, marks) if len(paths) == 1 else read_table(path)
+        table = table_of_log(path, marks, step_m) if len(paths) == 1 else read_table(path)
         for other in paths[1:]:
             table = table.beside(read_table(other))
         return readings_of_table(table, columns, path.stem, "; ".join(map(_sum, paths)))

@@ -29,7 +29,14 @@ SAME_LENGTH = 0.01  # Largest median difference of x, y, z from the magnitude by
 
 
 def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Readings:
-    """The readings in a table, of which the user `told` some columns; name and source are of its files.
+    """The readings of `rows_of_table`."""
+    return rows_of_table(table, told, name, source)[0]
+
+
+def rows_of_table(table: Table, told: Columns, name: str, source: str) -> tuple[Readings, NDArray[np.bool_]]:
+    """The readings in a table, of which the user `told` some columns, and which rows they are in.
+
+    Name and source are of its files.
 
     Refused are a column that is missing, with the nearest name; a cell that is no number, with file and line;
     a field that is in no unit, and columns that contradict each other.
@@ -65,7 +72,7 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
         _check_vectors(table, columns, vector[known], b[known], turn[known])
         vector = levelled(vector, turn, columns.axes or "body")[known]
     notes = [f"; {TAKEN}{note.replace('; ', ', ')}" for note in taken]  # "; " separates them
-    return Readings(
+    readings = Readings(
         p_xy=p[known],
         yaw=(turn if turn.ndim == 1 else yaw_from_quat(turn))[known],
         b_nt=b[known],
@@ -79,6 +86,7 @@ def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Re
         name=name,
         source=source + left_out(known) + "".join(notes),
     )
+    return readings, known
 
 
 def _within_steps(vector: Array, b: Array, taken: list[str]) -> tuple[Array, float]:
@@ -93,11 +101,13 @@ def _within_steps(vector: Array, b: Array, taken: list[str]) -> tuple[Array, flo
     return b, LEFT * step
 
 
-def field_of_table(table: Table) -> tuple[Array | None, Array, Array | None, str]:
+def field_of_table(table: Table, told: Columns) -> tuple[Array | None, Array, Array | None, str]:
     """Vectors, magnitudes [nT] and times [s] of a table that may lack positions, and the field's unit."""
-    columns, taken = _complete(table, Columns(heading=NO_HEADING), placed=False)
+    told = told if told.heading or told.quaternion else replace(told, heading=NO_HEADING)
+    columns, taken = _complete(table, told, placed=False)
     vector, b = _field(table, columns)
-    return vector, b, _times(table, columns, columns, taken), columns.unit or "nT"
+    unit = columns.unit or (f"units of {told.scale:g} nT" if told.scale else "nT")
+    return vector, np.where(b == 0, np.nan, b), _times(table, columns, told, taken), unit
 
 
 def left_out(known: NDArray[np.bool_]) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
+from magtwin.run.thinning import stretches
 from magtwin.tables.labels import words_of
 from magtwin.tables.table import Column, Table, since_1970
 
@@ -19,6 +20,9 @@ _PLACE = re.compile(r"\D*?([+-]?\d+(?:\.\d+)?)\s*[,;/ ]\s*(?:y\s*=?\s*)?([+-]?\d
 """A place in a note: `1.5,2`, `(1.5; 2)` or `x=1.5 y=2`."""
 
 LEAST_COVERED = 0.1  # Share of the log's time below which marks must be in another unit
+STEP_M_S2 = (
+    0.6  # Acceleration about its mean over a second beyond which a foot falls, and below which it rises
+)
 STILL_M_S2 = 0.4  # Standard deviation of the acceleration within a second below which nobody walks [m/s^2]
 LEAST_PAUSE_S = 1.5  # Shortest pause that counts [s]
 
@@ -31,17 +35,20 @@ in a pause, and above the second usually. Fields that hardly change show no paus
 class Marks:
     """When a walker passed which places."""
 
-    t: Array  # Times [s], ascending, shape (M,)
+    t: Array | None  # Times [s], ascending, shape (M,); None if only their order is known
     p_xy: Array  # Places [m], shape (M, 2)
     name: str  # Their file
 
 
-def marks_of(table: Table) -> Marks | None:
-    """The marks in a table: columns t, x and y, or t and notes such as `1.5,2`; None if it has none."""
+def marks_of(table: Table, *, timed: bool = True) -> Marks | None:
+    """The marks in a table: columns t, x and y, or t and notes such as `1.5,2`; None if it has none.
+
+    If they need not be `timed`, their order is enough.
+    """
     name = "".join(table.find("t"))
-    if not name:
+    if not name and timed:
         return None
-    t, _ = since_1970(table, name)
+    t = since_1970(table, name)[0] if name else np.arange(float(table.rows))
     if labels := table.find("x", "y"):
         p = np.column_stack([table.numbers(label, axis) for label, axis in zip(labels, "xy", strict=True)])
     else:
@@ -57,22 +64,58 @@ def marks_of(table: Table) -> Marks | None:
         raise InputError(f"{table.path}: {len(t)} mark; a walk needs two or more, as t,x,y")
     if len(same := np.flatnonzero(np.diff(t) <= 0)):
         raise InputError(f"{table.path}: two marks at {t[same[0]]:g} s; a walker passes one place at a time")
-    return Marks(t, p, table.path.name)
+    return Marks(t if name else None, p, table.path.name)
 
 
-def walked(table: Table, marks: Marks, moving: tuple[Array, Array] | None = None) -> Table:
+def walked(
+    table: Table, marks: Marks, moving: tuple[Array, Array] | None = None, step_m: float | None = None
+) -> Table:
     """A table of readings with the columns x and y of a walk: from mark to mark at a steady pace.
 
     In pauses the walker stands still. They are found by times [s] and accelerations [m/s^2] `moving`, shapes
-    (K,) and (K, 3), or else where the field does not change. Rows before the first mark and behind the last
-    have no place. Marks are in the clock of the table, or in seconds since its first row.
+    (K,) and (K, 3), or else where the field does not change. Marks are in the clock of the table, or in
+    seconds since its first row; rows before the first and behind the last have no place. Of marks without
+    times the first is where the log begins. The last is where it ends, unless the length of a step `step_m`
+    is given: then the walker is as far along as the steps in the accelerations.
     """
     name = "".join(table.find("t"))
     if not name:
         raise InputError(f"{table.path}: no column of time; marks are joined to readings by their times")
     t, _ = since_1970(table, name)
     begin, end = float(np.nanmin(t)), float(np.nanmax(t))
-    at, notes = marks.t, [f"places from {len(marks.t)} marks of {marks.name}, at a steady pace between them"]
+    notes = [
+        f"places from {len(marks.p_xy)} marks of {marks.name}"
+        + ", at a steady pace between them" * (step_m is None)
+    ]
+    if step_m is not None and (marks.t is not None or moving is None or not step_m > 0):
+        why = "has the times of its marks" if marks.t is not None else "needs a length above 0 m"
+        why = why if moving or marks.t is not None else "needs a log with accelerations"
+        raise InputError(f"{table.path}: {marks.name} {why}; drop --step-m", parameter="step_m")
+    at = np.array([begin, end]) if marks.t is None else _in_clock(marks.t, begin, end, table, marks, notes)
+    stills = _stills(*moving) if moving else _quiet(table, t)
+    stills = [(a, b) for a, b in stills if b > at[0] and a < at[-1]]
+    if stills and step_m is None:
+        by = "the acceleration" if moving else "a field that did not change"
+        notes.append(f"{len(stills)} pauses, {sum(b - a for a, b in stills):.0f} s in all, by {by}")
+    way_at, way = _moved(at, stills), _moved(t, stills)
+    if marks.t is None:
+        length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(marks.p_xy, axis=0), axis=1)))
+        if step_m is None:
+            way_at = way_at[0] + np.ptp(way_at) * length / length[-1]
+        elif moving is not None:
+            steps = _steps(*moving)
+            way, way_at = step_m * np.interp(t, steps, np.arange(len(steps))), length
+            notes.append(f"{len(steps) - 1} steps of {step_m:g} m, on a way of {length[-1]:.4g} m")
+    way_at = np.where(np.diff(way_at, prepend=-np.inf) > 0, way_at, way_at + 1e-9 * np.arange(len(way_at)))
+    p = np.column_stack([np.interp(way, way_at, part) for part in marks.p_xy.T])
+    p[~((t >= at[0]) & (t <= at[-1]) & (way <= way_at[-1]))] = np.nan
+    columns = [c for c in table.columns if c.name not in ("x", "y")]
+    placed = (Column(axis, part, table.path, None) for axis, part in zip("xy", p.T, strict=True))
+    return Table((*columns, *placed), (*table.notes, *notes), table.comments)
+
+
+def _in_clock(at: Array, begin: float, end: float, table: Table, marks: Marks, notes: list[str]) -> Array:
+    """Times of marks in the clock of a table, whose begin and end are given."""
     if at[-1] < begin or at[0] > end:
         if not -1 <= at[0] < at[-1] <= 1.05 * (end - begin) + 1:
             raise InputError(
@@ -86,18 +129,18 @@ def walked(table: Table, marks: Marks, moving: tuple[Array, Array] | None = None
             f"{table.path}: {marks.name} covers {100 * covered:.2g} % of its {end - begin:.6g} s; "
             "give both times in one unit, such as t [ms]"
         )
-    stills = _stills(*moving) if moving else _quiet(table, t)
-    stills = [(a, b) for a, b in stills if b > at[0] and a < at[-1]]
-    if stills:
-        by = "the acceleration" if moving else "a field that did not change"
-        notes.append(f"{len(stills)} pauses, {sum(b - a for a, b in stills):.0f} s in all, by {by}")
-    way_at, way = _moved(at, stills), _moved(t, stills)
-    way_at = np.where(np.diff(way_at, prepend=-np.inf) > 0, way_at, way_at + 1e-9 * np.arange(len(at)))
-    p = np.column_stack([np.interp(way, way_at, part) for part in marks.p_xy.T])
-    p[~((t >= at[0]) & (t <= at[-1]))] = np.nan
-    columns = [c for c in table.columns if c.name not in ("x", "y")]
-    placed = (Column(axis, part, table.path, None) for axis, part in zip("xy", p.T, strict=True))
-    return Table((*columns, *placed), (*table.notes, *notes), table.comments)
+    return at
+
+
+def _steps(t: Array, acceleration: Array) -> Array:
+    """The begin of a walk and the times of its steps [s], by accelerations that rise beyond a bound again."""
+    size = np.linalg.norm(acceleration, axis=1)
+    grid = np.arange(t[0], t[-1], 0.02)
+    size = np.convolve(np.interp(grid, t, size), np.ones(7) / 7, "same")
+    size -= np.convolve(np.pad(size, 25, "edge"), np.ones(51) / 51, "valid")
+    turns = np.flatnonzero(np.abs(size) > STEP_M_S2)
+    falls = turns[1:][(size[turns[1:]] > 0) & (size[turns[:-1]] < 0)]
+    return np.append(t[0], grid[falls])
 
 
 def _moved(t: Array, stills: list[tuple[float, float]]) -> Array:
@@ -114,7 +157,7 @@ def _stills(t: Array, acceleration: Array) -> list[tuple[float, float]]:
     for part in acceleration.T:
         mean = np.bincount(second, part) / count
         spread += np.bincount(second, (part - mean[second]) ** 2) / count
-    return _stretches(t[0] + np.append(halves, halves[-1] + 1) / 2, np.sqrt(spread) < STILL_M_S2)
+    return _pauses(t[0] + np.append(halves, halves[-1] + 1) / 2, np.sqrt(spread) < STILL_M_S2)
 
 
 def _quiet(table: Table, t: Array) -> list[tuple[float, float]]:
@@ -134,11 +177,10 @@ def _quiet(table: Table, t: Array) -> list[tuple[float, float]]:
     if noise == 0 or np.median(change) < LIVELY * noise:
         return []
     edges = (t[window // 2 :])[: len(change) + 1]
-    return _stretches(edges, change < QUIET * noise)
+    return _pauses(edges, change < QUIET * noise)
 
 
-def _stretches(edges: Array, flags: NDArray[np.bool_]) -> list[tuple[float, float]]:
-    """Begin and end of stretches of flags of `LEAST_PAUSE_S` or more."""
-    change = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    pairs = [(float(edges[a]), float(edges[b])) for a, b in change.reshape(-1, 2)]
+def _pauses(edges: Array, flags: NDArray[np.bool_]) -> list[tuple[float, float]]:
+    """Begin and end of the stretches of flags of `LEAST_PAUSE_S` or more."""
+    pairs = edges[stretches(flags)].tolist()
     return [(a, b) for a, b in pairs if b - a >= LEAST_PAUSE_S]

@@ -16,6 +16,7 @@ from magtwin.files.file import read_text
 from magtwin.report.report import Figure, Report
 from magtwin.report.verdict import verdict
 from magtwin.run.run import Run
+from magtwin.run.thinning import stretches
 
 Array = NDArray[np.float64]
 
@@ -387,12 +388,12 @@ def _ridge(gram: Array, along: Array, penalty: float) -> Array:
 
 def _cross_validated(matrix: Array, b: Array) -> float:
     """The penalty that best predicts each of `FOLDS` stretches from the others."""
-    stretches = [slice(rows[0], rows[-1] + 1) for rows in np.array_split(np.arange(len(b)), FOLDS)]
-    grams = [matrix[s].T @ matrix[s] for s in stretches]
-    alongs = [matrix[s].T @ b[s] for s in stretches]
+    parts = [slice(rows[0], rows[-1] + 1) for rows in np.array_split(np.arange(len(b)), FOLDS)]
+    grams = [matrix[s].T @ matrix[s] for s in parts]
+    alongs = [matrix[s].T @ b[s] for s in parts]
     gram, along = np.sum(grams, axis=0), np.sum(alongs, axis=0)
     errors = np.zeros(len(RIDGES))
-    for stretch, own, own_along in zip(stretches, grams, alongs, strict=True):
+    for stretch, own, own_along in zip(parts, grams, alongs, strict=True):
         left = len(b) - (stretch.stop - stretch.start)
         for k, ridge in enumerate(RIDGES):
             c = _ridge(gram - own, along - own_along, ridge * left)
@@ -417,10 +418,7 @@ def _unbroken(run: Run) -> tuple[Array, slice, float]:
             "magnetometer, or simulate a scene whose Earth field is known"
         )
     fine = np.isfinite(run["b_measured_nt"] - run["b_map_nt"]) & np.isfinite(b_vector).all(axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], fine.astype(np.int8), [0]])))
-    starts, stops = edges[::2], edges[1::2]
-    k = int(np.argmax(stops - starts))
-    rows = slice(int(starts[k]), int(stops[k]))
+    rows = slice(*max(stretches(fine).tolist(), key=lambda ends: ends[1] - ends[0], default=(0, 0)))
     t = run["t"][rows]
     if len(t) < 3:
         raise InputError(f"only {len(t)} readings in a row have a map and a vector; a fit needs more")
