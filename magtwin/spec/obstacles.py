@@ -63,9 +63,7 @@ class Obstacles(Summarized):
         nearest, which = np.full(len(p), np.inf), np.full(len(p), -1)
         for i, outline in enumerate(self.outlines):
             low, high = outline.min(axis=0) - reach_m, outline.max(axis=0) + reach_m
-            rows = np.flatnonzero(
-                (p[:, 0] >= low[0]) & (p[:, 0] <= high[0]) & (p[:, 1] >= low[1]) & (p[:, 1] <= high[1])
-            )
+            rows = np.flatnonzero(np.all((p >= low) & (p <= high), axis=1))
             if not len(rows):
                 continue
             distance = _distance(p[rows], outline)
@@ -84,9 +82,8 @@ class Obstacles(Summarized):
 
     def _summary(self) -> Summary:
         names = ["/".join(name.split("/")[-2:]) for name in self.names]
-        return Summary(
-            f"Obstacles: {len(self)}, {len(self.triangles):,} triangles", (("names", listed(names, 80)),)
-        )
+        title = f"Obstacles: {len(self)}, {len(self.triangles):,} triangles"
+        return Summary(title, (("names", listed(names, 80)),))
 
 
 def _distance(p: Array, outline: Array) -> Array:

@@ -133,7 +133,7 @@ def open_unwritten(
             known[key] = make()
         return known[key]
 
-    def placed(robot: RobotSpec) -> RobotSpec:
+    def placed(k: int, robot: RobotSpec) -> RobotSpec:
         asset = once(robot.asset, lambda: load_robot(robot.asset))
         for part in ("magnetometer", "lidar"):
             name = f"p_base_{part}"
@@ -144,8 +144,7 @@ def open_unwritten(
 
     author = importlib.import_module("magtwin.author.room")  # by name: who opens a stage needs no author
     importlib.import_module("magtwin.author.scene").check_things(scene)
-    others = tuple(dataclasses.replace(other, robot=placed(other.robot)) for other in scene.others)
-    scene = dataclasses.replace(scene, robot=placed(scene.robot), others=others)
+    scene = scene.with_robots(placed)
     checksum = once((scene.map_layer, "sha256"), lambda: layer_sha256(scene.map_layer))
     if scene.map_sha256 not in ("", checksum):
         check_map(scene)
@@ -176,15 +175,7 @@ def _twin_of(
     """
     from magtwin.usd.layers import layer_sha256
 
-    read = stage.scene
-    read = dataclasses.replace(
-        read,
-        robot=_with_magnetometer(read.robot, network, magnetometer),
-        others=tuple(
-            dataclasses.replace(other, robot=_with_magnetometer(other.robot, network, magnetometer))
-            for other in read.others
-        ),
-    )
+    read = stage.scene.with_robots(lambda k, robot: _with_magnetometer(robot, network, magnetometer))
     field, predictor = stage.map, _magnetometer(read)
     if stage.stage is not None and "scene_sha256" not in metadata:
         metadata["scene_sha256"] = stage.sha256

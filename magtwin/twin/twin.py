@@ -110,9 +110,6 @@ class Twin(Summarized):
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "opened": None}  # an open stage stays in its process
 
-    def __setstate__(self, state: dict[str, object]) -> None:
-        self.__dict__.update(state)
-
     def _summary(self) -> Summary:
         """The scene and its file, the robot, the map and the network."""
         robot, field = self.scene.robot, self.field._summary()
@@ -171,16 +168,12 @@ def opened(
 def without_tracking_error(twin: Twin) -> Twin:
     """The twin whose controllers get exact poses."""
 
-    def changed(robot: RobotSpec) -> RobotSpec:
-        drive = dataclasses.replace(
-            robot.drive, localization_std_m=0.0, localization_yaw_std=0.0, localization_latency_s=0.0
-        )
-        return dataclasses.replace(robot, drive=drive)
+    def changed(k: int, robot: RobotSpec) -> RobotSpec:
+        exact = {"localization_std_m": 0.0, "localization_yaw_std": 0.0, "localization_latency_s": 0.0}
+        return dataclasses.replace(robot, drive=dataclasses.replace(robot.drive, **exact))  # type: ignore[arg-type]
 
-    scene = twin.scene
-    others = tuple(dataclasses.replace(other, robot=changed(other.robot)) for other in scene.others)
-    scene = dataclasses.replace(scene, robot=changed(scene.robot), others=others)
-    return dataclasses.replace(twin, scene=scene, metadata={**twin.metadata, "tracking_error": False})
+    metadata = {**twin.metadata, "tracking_error": False}
+    return dataclasses.replace(twin, scene=twin.scene.with_robots(changed), metadata=metadata)
 
 
 def without_model_error(twin: Twin) -> Twin:
@@ -207,13 +200,11 @@ def scene_sha256(scene: Scene) -> str:
         sensor = dataclasses.replace(robot.magnetometer, network=None, network_sha256="", inputs=())
         return dataclasses.replace(robot, asset=FilePath(), magnetometer=sensor)
 
-    others = tuple(  # the sensors of other robots do not change this run
-        dataclasses.replace(
-            other, robot=bare(dataclasses.replace(other.robot, magnetometer=MagnetometerSpec())), path=""
-        )
-        for other in scene.others
-    )
+    def bare_of(k: int, robot: RobotSpec) -> RobotSpec:  # sensors of other robots do not change this run
+        return bare(dataclasses.replace(robot, magnetometer=MagnetometerSpec()) if k else robot)
+
+    scene = dataclasses.replace(scene.with_robots(bare_of), map_layer=FilePath(), map_sha256="", path="")
     scene = dataclasses.replace(
-        scene, map_layer=FilePath(), map_sha256="", robot=bare(scene.robot), path="", others=others
+        scene, others=tuple(dataclasses.replace(other, path="") for other in scene.others)
     )
     return hashlib.sha256(spelled(scene).encode()).hexdigest()
