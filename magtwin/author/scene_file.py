@@ -14,7 +14,7 @@ from magtwin.author.robot import RobotSettings, build_robot
 from magtwin.author.room import asset_named, check_name, check_start, lab_of, obstacles_in
 from magtwin.author.scene import check_names, check_things
 from magtwin.author.walls import DoorTable, WallTable, check_not_in_walls, lab_with_walls
-from magtwin.errors import InputError
+from magtwin.errors import InputError, about
 from magtwin.files.file import existing_file, sha256
 from magtwin.files.kinds import expected
 from magtwin.files.settings import from_table, read_toml, refused_at
@@ -237,15 +237,6 @@ def scene_from_toml(
             surveyed = survey_of(scene, given.survey or SurveySpec(), given.seed, standing)
         scene = replace(scene, map_layer=surveyed, map_sha256=layer_sha256(surveyed))
     return scene
-
-
-@contextmanager
-def about(start: str) -> Iterator[None]:
-    """Errors inside begin with what they are about."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{start} {error}") from error
 
 
 @contextmanager

@@ -397,9 +397,7 @@ def blocked_by(scene: Scene, obstacles: Obstacles) -> Callable[[Array], NDArray[
     if floor:
         sides = [side.name for side in scene.lab.sides]
         inner = [k for k, name in enumerate(obstacles.names) if name.split("/")[-2] not in sides]
-    standing = Obstacles(
-        tuple(obstacles.names[k] for k in inner), tuple(obstacles.outlines[k] for k in inner)
-    )
+    standing = obstacles.only(inner)
     radius = scene.robot.footprint_radius_m
 
     def blocked(nodes: Array) -> NDArray[np.bool_]:

@@ -341,6 +341,7 @@ class MocapSpec(Spec):
         super().__post_init__()
         self._above_zero("rate_hz")
         what = f"not make the latency of {self.latency_s} s negative"
-        self._require("latency_drift_s", self.latency_s + self.latency_drift_s >= 0, what, self.latency_drift_s)
+        drift = self.latency_drift_s
+        self._require("latency_drift_s", self.latency_s + drift >= 0, what, drift)
         self._not_negative("latency_s", "jitter_s", "p_noise_std_m", "angle_noise_std")
         self._not_negative("dropout_every_s", "dropout_s")

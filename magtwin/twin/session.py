@@ -68,9 +68,7 @@ def with_plant(twin: Twin, plant: PlantSpec | str | None) -> Twin:
     if not isinstance(plant, PlantSpec | str):
         raise InputError(f"plant must be a name or a PlantSpec, got {plant!r}", parameter="plant")
     text = plant if isinstance(plant, str) else plant_text(plant)
-    scene = twin.scene.with_robots(
-        lambda k, robot: dataclasses.replace(robot, plant=plant_of(text, which=k))
-    )
+    scene = twin.scene.with_robots(lambda k, robot: dataclasses.replace(robot, plant=plant_of(text, which=k)))
     return dataclasses.replace(twin, scene=scene, metadata={**twin.metadata, "plant": text})
 
 

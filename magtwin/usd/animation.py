@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
-from magtwin.errors import InputError, find
+from magtwin.errors import InputError, about, find
 from magtwin.files.outputs import output
 from magtwin.frames import quat_conjugate, quat_multiply, rotate
 from magtwin.run import mapped
@@ -232,10 +232,8 @@ def _read(layer: Sdf.Layer, path: str | os.PathLike[str]) -> Run:
             unit, frame = said.get("unit", ""), said.get("frame", "")
             specs[name] = Column(unit, frame, attribute.documentation, len(parts) or 1, parts, rule)
     metadata = json.loads(layer.customLayerData.get(_FACTS, "{}"))
-    try:
+    with about(f"{path}: holds a damaged run:"):
         return Run(columns, {k: v for k, v in metadata.items() if isinstance(v, str | int | float)}, specs)
-    except InputError as error:
-        raise InputError(f"{path}: holds a damaged run: {error}") from error
 
 
 def _run_path(layer: Sdf.Layer) -> Sdf.Path:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, about
 from magtwin.frames import wxyz_from_xyzw, xyzw_from_wxyz
 from magtwin.spec.base import Quat, Vec3
 from magtwin.usd.layers import relative_asset
@@ -47,10 +47,8 @@ def read_spec(cls: type[S], prim: Usd.Prim, noun: str, **known: Any) -> S:
     for field in fields(cls):  # type: ignore[arg-type]
         if field.name not in known:
             values[field.name] = plain_value(prim.GetAttribute(attribute_name(noun, field.name)))
-    try:
+    with about(f"{place(prim)}:"):
         return cls(**values)
-    except InputError as error:
-        raise InputError(f"{place(prim)}: {error}") from error
 
 
 def read_axis(prim: Usd.Prim, name: str = "axis") -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, about
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.scene_state import changes_since
 from magtwin.files.outputs import transaction
@@ -198,7 +198,7 @@ def open_scene(
                 "a scene share one"
             )
     sources, furniture = read_magnets(stage)
-    try:
+    with about(f"{place(prims[0])}:"):
         scene = Scene(
             name=path.stem,
             map_layer=layer.resolve(),
@@ -212,8 +212,6 @@ def open_scene(
             path=robots[0].path,
             others=tuple(robots[1:]),
         )
-    except InputError as error:
-        raise InputError(f"{place(prims[0])}: {error}") from error
     if scene.map_layer != path.resolve():  # a flattened stage is its own map, and has no checksum
         check_map(scene, f"{place(magnetometers[0])}: ")
     made = anomaly_map.made_from
@@ -463,7 +461,5 @@ def _read_placed(prim: Usd.Prim, check_network: bool, notes: list[str]) -> Place
         notes.append(
             f"{place(prim)}: stands {p[2]:g} m above the floor or tilted; a run starts it on the floor"
         )
-    try:
+    with about(f"{place(prim)}:"):
         return PlacedRobot(robot=robot, start=(p[0], p[1], float(yaw_from_quat(q))), path=read_path(prim))
-    except InputError as error:
-        raise InputError(f"{place(prim)}: {error}") from error

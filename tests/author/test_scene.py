@@ -76,7 +76,7 @@ def define_robot_asset(path: Path) -> None:
             )
         sensors.define_footprint(root, 0.2)
         sensors.define_drive(root, DriveSpec(v_max=0.4))
-        sensors.define_platform(root, PlatformFieldSpec(hard_iron_nt=(1.0, 2.0, 3.0)))
+        sensors.define_on_root(root, "platform", PlatformFieldSpec(hard_iron_nt=(1.0, 2.0, 3.0)))
         sensors.define_battery(stage, "/bot/battery", BatterySpec(load_w=12.0))
         mount = MagnetometerSpec(p_link_sensor=(0.0, 0.0, 0.01))
         sensors.define_magnetometer(stage, "/bot/magnetometer_link/magnetometer", mount)

@@ -275,19 +275,8 @@ def motion_of(closed_loop: ClosedLoop, record: Array) -> Motion:
     poses[0] = closed_loop.pose0
     for rows in mapped.parts(len(x)):
         poses[rows.start + 1 : rows.stop + 1] = np.stack([x[rows], y[rows], yaw[rows]], axis=1)
-    return Motion(
-        closed_loop.drive,
-        closed_loop.dt,
-        v,
-        w,
-        closed_loop.pose0,
-        wheel_v=wheel_v,
-        wheel_w=wheel_w,
-        v_cmd=v_cmd,
-        w_cmd=w_cmd,
-        bump=bump > 0,
-        poses=poses,
-    )
+    known = {"wheel_v": wheel_v, "wheel_w": wheel_w, "v_cmd": v_cmd, "w_cmd": w_cmd, "poses": poses}
+    return Motion(closed_loop.drive, closed_loop.dt, v, w, closed_loop.pose0, bump=bump > 0, **known)
 
 
 class Chassis:

@@ -184,15 +184,8 @@ class Motion:
             raise InputError(f"v and w of a Motion must have one shape (K,), got {v.shape} and {w.shape}")
         if not (np.isfinite(v).all() and np.isfinite(w).all()):
             raise InputError("a speed or yaw rate of a Motion is not finite")
-        known = {
-            "v": v,
-            "w": w,
-            "wheel_v": v,
-            "wheel_w": w,
-            "v_cmd": v,
-            "w_cmd": w,
-            "bump": np.zeros(len(v), bool),
-        }
+        known = {"v": v, "w": w, "wheel_v": v, "wheel_w": w, "v_cmd": v, "w_cmd": w}
+        known["bump"] = np.zeros(len(v), bool)
         for name, default in known.items():
             given = getattr(self, name)
             array = default if given is None else np.asarray(given, default.dtype)

@@ -113,14 +113,10 @@ class Driver:
     def _decide(self, t: float, x: float, y: float, yaw: float, v: float) -> tuple[float, float]:
         """Decide on a command."""
         drive = self._drive
-        noise_v, noise_w, begins = (
-            self._rng.standard_normal(),
-            self._rng.standard_normal(),
-            self._rng.random(),
-        )
-        for name, noise, tau in (("_ou_v", noise_v, SPEED_TAU_S), ("_ou_w", noise_w, TURN_TAU_S)):
-            left = math.exp(-DECIDE_S / tau)
+        for name, tau in (("_ou_v", SPEED_TAU_S), ("_ou_w", TURN_TAU_S)):
+            left, noise = math.exp(-DECIDE_S / tau), self._rng.standard_normal()
             setattr(self, name, left * getattr(self, name) + math.sqrt(1 - left * left) * noise)
+        begins = self._rng.random()
         self._visit(t, x, y)
         if t < self._pause_until:
             return 0.0, 0.0
@@ -130,9 +126,8 @@ class Driver:
         off = self._direction(x, y, yaw)
         wanted_w = STEER * off + TURN_STD * self._ou_w
         wanted_w = min(max(wanted_w, -0.9 * drive.w_max), 0.9 * drive.w_max)
-        wanted_v = (
-            self._speed * (1.0 + SPEED_SHARE * self._ou_v) * max(0.0, math.cos(min(abs(off), math.pi / 2)))
-        )
+        ahead = max(0.0, math.cos(min(abs(off), math.pi / 2)))
+        wanted_v = self._speed * (1.0 + SPEED_SHARE * self._ou_v) * ahead
         wanted_v = min(max(wanted_v, 0.0), drive.v_max)
         for share in (1.0, 0.6, 0.3, 0.1):
             if self._safe(x, y, yaw, max(wanted_v * share, 0.0), v, wanted_w):

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, about
 from magtwin.field.sources.magnets import body_of
 from magtwin.field.sources.moments import mesh_moments
 from magtwin.frames import IDENTITY_XYZW, canonical, quat_conjugate, quat_multiply, rotate, xyzw_from_wxyz
@@ -72,10 +72,8 @@ def define_source(
         else:
             hide(UsdGeom.Gprim(prim), material)
         if spec.shape != "mesh" and shown:
-            turn = _turn(spec)
-            define_visual(
-                stage, visual_path(path), spec.shape, spec.p_world, spec.size_m, material, q_xyzw=turn
-            )
+            where = spec.p_world, spec.size_m, material
+            define_visual(stage, visual_path(path), spec.shape, *where, q_xyzw=_turn(spec))
     apply_api(prim, "source")
     for name, value in figures.items():
         author(prim.GetAttribute(attribute_name("source", name)), value)
@@ -164,7 +162,7 @@ def read_source(prim: Usd.Prim, *, name: str | None = None, local: bool = False)
         for key in ("moment", "magnetization", "susceptibility")
     }
     p, q, scale = read_transform(prim, local=local)
-    try:
+    with about(f"{place(prim)}:"):
         spec: dict[str, Any] = {"name": name or prim.GetName(), "p_world": p, "shape": shape}
         if shape == "point":
             return _point(spec, q, **figures)
@@ -176,11 +174,8 @@ def read_source(prim: Usd.Prim, *, name: str | None = None, local: bool = False)
                 raise InputError("has both a moment and a magnetization; give one of them")
             volume_m3 = body_of(SourceSpec(**spec)).volume_m3
             own["magnetization"] = _vec3(part / volume_m3 for part in own["moment"])
-        return SourceSpec(
-            **spec, magnetization=own["magnetization"], susceptibility=figures["susceptibility"]
-        )
-    except InputError as error:
-        raise InputError(f"{place(prim)}: {error}") from error
+        spec |= {"magnetization": own["magnetization"], "susceptibility": figures["susceptibility"]}
+        return SourceSpec(**spec)
 
 
 def _point(

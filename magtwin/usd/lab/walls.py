@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, about
 from magtwin.frames import IDENTITY_XYZW, quat_from_yaw, yaw_from_quat
 from magtwin.spec.base import Quat, Vec3
 from magtwin.spec.furniture import Part
@@ -109,10 +109,8 @@ def read_lab(lab: Usd.Prim) -> LabSpec:
     read, room = read_walls(lab), _read_room(lab)
     if not (read.walls or read.doors or read.windows):
         return room
-    try:
+    with about(f"{place(lab)}:"):
         return replace(room, walls=read.walls, doors=read.doors, windows=read.windows)
-    except InputError as error:
-        raise InputError(f"{place(lab)}: {error}") from error
 
 
 def _read_room(lab: Usd.Prim) -> LabSpec:

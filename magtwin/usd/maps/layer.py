@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Usd, UsdGeom, Vt
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, about
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.usd.layers import new_stage, open_stage, translates
@@ -178,7 +178,7 @@ def read_map(prim: Usd.Prim) -> AnomalyMap:
             f"{place(prim)}: the map's values are not those that were recorded, in single precision; make "
             "the map anew"
         )
-    try:
+    with about(f"{place(prim)}:"):
         return AnomalyMap(
             values_nt=values.reshape(shape).astype(float) if recorded is None else recorded,
             valid=valid.reshape(shape).astype(bool),
@@ -195,8 +195,6 @@ def read_map(prim: Usd.Prim) -> AnomalyMap:
             **{name: get(prim, name) for name in PLACES},
             **{name: get(prim, name) for name in TEXTS},
         )
-    except InputError as error:
-        raise InputError(f"{place(prim)}: {error}") from error
 
 
 def _read_recorded(prim: Usd.Prim, name: str, shape: tuple[int, ...]) -> NDArray | None:
