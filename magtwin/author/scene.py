@@ -17,7 +17,7 @@ from magtwin.files.outputs import output
 from magtwin.frames import quat_from_yaw
 from magtwin.spec.furniture import FurnitureSpec
 from magtwin.spec.magnetics import SourceSpec
-from magtwin.spec.robot import PlacedRobot
+from magtwin.spec.robot import PlacedRobot, fields_of
 from magtwin.spec.scene import Scene
 from magtwin.urdf.convert import THUMBNAILS
 from magtwin.usd.attributes import check_prim_name, write_pose
@@ -175,13 +175,7 @@ def _with_copies(scene: Scene, folder: Path) -> Scene:
             path = once(path, "paths", robot.name, _copied)
         robot = replace(robot, asset=asset, magnetometer=magnetometer)
         robots.append(PlacedRobot(robot=robot, start=placed.start, path=path))
-    return replace(
-        scene,
-        map_layer=_copied(scene.map_layer, folder / "map"),
-        robot=robots[0].robot,
-        path=robots[0].path,
-        others=tuple(robots[1:]),
-    )
+    return replace(scene, map_layer=_copied(scene.map_layer, folder / "map"), **fields_of(robots))
 
 
 def _copied(file: Path, folder: Path) -> Path:

@@ -25,7 +25,7 @@ from magtwin.spec.furniture import FurnitureSpec
 from magtwin.spec.lab import LabSpec, SurveySpec
 from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.robot import PlacedRobot, RobotSpec
+from magtwin.spec.robot import PlacedRobot, RobotSpec, fields_of
 from magtwin.spec.scene import Scene
 from magtwin.spec.walls import Window
 from magtwin.usd.lab.earth import checked
@@ -221,14 +221,11 @@ def scene_from_toml(
         name=given.name,
         map_layer=Path("surveyed") if layer is None else layer,
         map_sha256="" if layer is None else layer_sha256(layer),
-        robot=robots[0].robot,
         lab=lab,
         earth=earth,
         sources=sources,
         furniture=pieces,
-        start=robots[0].start,
-        path=robots[0].path,
-        others=tuple(robots[1:]),
+        **fields_of(robots),
     )
     with about(f"{path}:"):
         check_things(scene)
@@ -340,18 +337,14 @@ def _with_network(
 ) -> RobotSpec:
     """The robot with the weights and the kind of its table; `network` replaces the weights."""
     weights = Path(network).resolve() if network is not None else table.network
+    changes: dict[str, Any] = {}
     if weights is not None:
         weights = expected(weights, "weights file")
-        magnetometer = replace(
-            robot.magnetometer,
-            kind="neural",
-            network=weights,
-            network_sha256=sha256(weights),
-            inputs=inputs_of(weights),
-        )
-        robot = replace(robot, magnetometer=magnetometer)
+        changes = {"kind": "neural", "network": weights, "network_sha256": sha256(weights)}
+        changes["inputs"] = inputs_of(weights)
     if table.kind is not None and network is None:
-        robot = replace(robot, magnetometer=replace(robot.magnetometer, kind=table.kind))
+        changes["kind"] = table.kind
+    robot = replace(robot, magnetometer=replace(robot.magnetometer, **changes))
     if robot.magnetometer.kind == "neural" and robot.magnetometer.network is None:
         raise InputError(f'{where} kind = "neural" needs network = "FILE"')
     return robot

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,8 @@ def toml_text(table: Mapping[str, Any]) -> str:
     def write(table: Mapping[str, Any], section: str) -> None:
         below = []
         for key, value in table.items():
-            if isinstance(value, Mapping) or (isinstance(value, list) and value and _are_tables(value)):
+            several = isinstance(value, list) and value and all(isinstance(v, Mapping) for v in value)
+            if isinstance(value, Mapping) or several:
                 below.append((f"{section}.{_key(key)}" if section else _key(key), value))
             else:
                 lines.append(f"{_key(key)} = {_text(value)}")
@@ -37,10 +38,6 @@ def toml_text(table: Mapping[str, Any]) -> str:
 
     write(table, "")
     return "\n".join(lines).strip() + "\n"
-
-
-def _are_tables(values: Sequence[Any]) -> bool:
-    return all(isinstance(value, Mapping) for value in values)
 
 
 def _key(key: str) -> str:

@@ -1,7 +1,9 @@
 """A robot: its USD asset, drive, sensors and magnetic field; and its place in a scene."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from magtwin.frames import IDENTITY_XYZW, quat_multiply, rotate
 from magtwin.report.summary import Summarized, Summary
@@ -126,3 +128,9 @@ class PlacedRobot(Summarized, Spec):
 
     path: str | Path = ""
     """Default path: a name of `magtwin.path.PATHS`, "random", or a CSV file; "" for the caller's default."""
+
+
+def fields_of(robots: Sequence[PlacedRobot]) -> dict[str, Any]:
+    """The fields of a `Scene` with these robots, by name."""
+    first, *others = robots
+    return {"robot": first.robot, "start": first.start, "path": first.path, "others": tuple(others)}

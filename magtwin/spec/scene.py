@@ -13,7 +13,7 @@ from magtwin.spec.base import ZERO3, Spec, Vec3
 from magtwin.spec.furniture import FurnitureSpec, steel_of
 from magtwin.spec.lab import LabSpec
 from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
-from magtwin.spec.robot import PlacedRobot, RobotSpec
+from magtwin.spec.robot import PlacedRobot, RobotSpec, fields_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -68,15 +68,14 @@ class Scene(Summarized, Spec):
 
     def with_robots(self, change: Callable[[int, RobotSpec], RobotSpec]) -> "Scene":
         """The scene with each robot as `change` makes it of its number, from 0, and its spec."""
-        first, *rest = (change(k, placed.robot) for k, placed in enumerate(self.robots))
-        others = tuple(replace(o, robot=robot) for o, robot in zip(self.others, rest, strict=True))
-        return replace(self, robot=first, others=others)
+        robots = [replace(placed, robot=change(k, placed.robot)) for k, placed in enumerate(self.robots)]
+        return replace(self, **fields_of(robots))
 
     def led_by(self, name: str) -> "Scene":
         """The scene with the robot called `name` as the first robot."""
         placed = find("robot", name, {placed.robot.name: placed for placed in self.robots})
-        rest = tuple(other for other in self.robots if other.robot.name != name)
-        return replace(self, robot=placed.robot, start=placed.start, path=placed.path, others=rest)
+        rest = [other for other in self.robots if other.robot.name != name]
+        return replace(self, **fields_of([placed, *rest]))
 
     def with_(self, changes: Mapping[str, Any] | None = None, **values: Any) -> "Scene":
         """The scene with something changed. The map stays: `open_twin` warns where and by how much it is off.

@@ -17,7 +17,7 @@ from magtwin.report.summary import Summarized, Summary
 from magtwin.spec.base import spelled
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.plant import PlantSpec
-from magtwin.spec.robot import RobotSpec
+from magtwin.spec.robot import PlacedRobot, RobotSpec, fields_of
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import MagnetometerSpec
 
@@ -196,15 +196,12 @@ def checked_seed(seed: object) -> int:
 def scene_sha256(scene: Scene) -> str:
     """Checksum of every value of a scene in its session, without its files, which have checksums."""
 
-    def bare(robot: RobotSpec) -> RobotSpec:
-        sensor = dataclasses.replace(robot.magnetometer, network=None, network_sha256="", inputs=())
-        return dataclasses.replace(robot, asset=FilePath(), magnetometer=sensor)
+    def bare(k: int, placed: PlacedRobot) -> PlacedRobot:
+        sensor = MagnetometerSpec() if k else placed.robot.magnetometer  # those of others change nothing here
+        sensor = dataclasses.replace(sensor, network=None, network_sha256="", inputs=())
+        robot = dataclasses.replace(placed.robot, asset=FilePath(), magnetometer=sensor)
+        return dataclasses.replace(placed, robot=robot, path="")
 
-    def bare_of(k: int, robot: RobotSpec) -> RobotSpec:  # sensors of other robots do not change this run
-        return bare(dataclasses.replace(robot, magnetometer=MagnetometerSpec()) if k else robot)
-
-    scene = dataclasses.replace(scene.with_robots(bare_of), map_layer=FilePath(), map_sha256="", path="")
-    scene = dataclasses.replace(
-        scene, others=tuple(dataclasses.replace(other, path="") for other in scene.others)
-    )
+    robots = fields_of([bare(k, placed) for k, placed in enumerate(scene.robots)])
+    scene = dataclasses.replace(scene, map_layer=FilePath(), map_sha256="", **robots)
     return hashlib.sha256(spelled(scene).encode()).hexdigest()

@@ -20,7 +20,7 @@ from magtwin.files.outputs import transaction
 from magtwin.frames import yaw_from_quat
 from magtwin.spec.magnetics import EarthFieldSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.robot import PlacedRobot
+from magtwin.spec.robot import PlacedRobot, fields_of
 from magtwin.spec.scene import Scene
 from magtwin.usd.attributes import plain_value, read_pose, target
 from magtwin.usd.geometry import Link, Shape, read_links, read_shapes
@@ -203,14 +203,11 @@ def open_scene(
             name=path.stem,
             map_layer=layer.resolve(),
             map_sha256=checksum,
-            robot=robots[0].robot,
             lab=read_lab(only_prim_with(stage.GetPseudoRoot(), "lab")),
             earth=earth,
             sources=sources,
             furniture=furniture,
-            start=robots[0].start,
-            path=robots[0].path,
-            others=tuple(robots[1:]),
+            **fields_of(robots),
         )
     if scene.map_layer != path.resolve():  # a flattened stage is its own map, and has no checksum
         check_map(scene, f"{place(magnetometers[0])}: ")
@@ -292,7 +289,8 @@ def earth_in(stage: Usd.Stage, lab: Lab) -> tuple[EarthFieldSpec | None, list[st
     The lab's own field turns with the lab: the map was measured with it. Without one, the field of the stage
     is turned into the lab's axes.
     """
-    found = [(prim, _turned(read_earth(prim), into_lab(lab, prim))) for prim in _all_with(stage, "earth")]
+    prims = [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if has_api(prim, "earth")]
+    found = [(prim, _turned(read_earth(prim), into_lab(lab, prim))) for prim in prims]
     own = [(p, e) for p, e in found if nearest_lab(p, labs_on(stage)) == lab]
     free = [(p, e) for p, e in found if nearest_lab(p, labs_on(stage)) is None]
     for those in (own, [] if own else free):
@@ -323,10 +321,6 @@ def _turned(earth: EarthFieldSpec, matrix: Gf.Matrix4d) -> EarthFieldSpec:
     north = turn.TransformDir(Gf.Vec3d(0, 1, 0))
     yaw = math.degrees(math.atan2(-north[0], north[1]))
     return replace(earth, b_world_nt=(x, y, z), north_deg=math.remainder(earth.north_deg + yaw, 360))
-
-
-def _all_with(stage: Usd.Stage, noun: str) -> list[Usd.Prim]:
-    return [p for p in stage.Traverse(Usd.TraverseInstanceProxies()) if has_api(p, noun)]
 
 
 def map_of(magnetometer: Usd.Prim) -> Usd.Prim:
@@ -447,13 +441,11 @@ def _read_placed(prim: Usd.Prim, check_network: bool, notes: list[str]) -> Place
             f"{place(prim)}: the robot is scaled or mirrored; clear its scale and those above it"
         )
     robot = read_robot(prim)
-    network = robot.magnetometer.network
-    neural = robot.magnetometer.kind == "neural"
-    if check_network and neural and network is not None and not network.exists():
-        raise InputError(
-            f"{place(only_prim_with(prim, 'magnetometer'))}: magtwin:magnetometer:network names {network}, "
-            "which is not there"
-        )
+    sensor, network = only_prim_with(prim, "magnetometer"), robot.magnetometer.network
+    neural = check_network and robot.magnetometer.kind == "neural"
+    if neural and network is not None and not network.exists():
+        text = f"magtwin:magnetometer:network names {network}, which is not there"
+        raise InputError(f"{place(sensor)}: {text}")
     p, q = read_pose(prim)
     if UsdGeom.XformCache().GetParentToWorldTransform(prim) != Gf.Matrix4d(1):
         p, q, _ = read_transform(prim)

@@ -122,14 +122,11 @@ def check_arrived(path: Path, speed: float, closed_loop: ClosedLoop, motion: Tra
     """Refuse a motion that took all steps that were allowed for reaching the end of a path."""
     allowed_s = closed_loop.steps * closed_loop.dt
     if motion.duration_s > allowed_s - 0.5 * closed_loop.dt:
-        why = (
-            "the robot stands at an obstacle"
-            if motion.at([motion.duration_s]).bump[-1]
-            else "it winds too tightly for this drive: smooth it, or drive more slowly"
-        )
-        raise InputError(
-            f"path {path.name}: its end was not reached in {allowed_s:.0f} s at {speed:g} m/s; {why}"
-        )
+        why = "it winds too tightly for this drive: smooth it, or drive more slowly"
+        if motion.at([motion.duration_s]).bump[-1]:
+            why = "the robot stands at an obstacle"
+        what = f"its end was not reached in {allowed_s:.0f} s at {speed:g} m/s"
+        raise InputError(f"path {path.name}: {what}; {why}")
 
 
 def play(

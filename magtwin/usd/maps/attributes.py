@@ -57,18 +57,15 @@ def read_height(prim: Usd.Prim) -> float | None:
     if height is None:
         return None
     if not isinstance(height, float) or not math.isfinite(height):
-        raise InputError(
-            f"{attribute.GetName()} must be a length [m], got {height!r}; clear it where unknown"
-        )
+        text = f"must be a length [m], got {height!r}; clear it where unknown"
+        raise InputError(f"{attribute.GetName()} {text}")
     return height
 
 
 def read_parameters(text: str) -> dict[str, Any]:
     """Parameters from their JSON; empty if there is none."""
-    name, got = (
-        attribute_name("anomalyMap", "parameters"),
-        f"got {text[:MOST_CHARACTERS]!r}; make the map anew",
-    )
+    name = attribute_name("anomalyMap", "parameters")
+    got = f"got {text[:MOST_CHARACTERS]!r}; make the map anew"
     try:
         figures = json.loads(text or "{}")
         json.dumps(figures, allow_nan=False)  # refuses NaN, and 1e999, which is infinite
