@@ -67,14 +67,10 @@ def table_of_scene(scene: Scene) -> Table:
     if scene.earth is not None:
         table["earth"] = table_of(scene.earth)
     if scene.sources:
-        table["source"] = [
-            table_of(source, leave={"size_m"} if source.faces else set()) for source in scene.sources
-        ]
+        table["source"] = [table_of(s, leave={"size_m"} if s.faces else set()) for s in scene.sources]
     if scene.furniture:  # magnetization is given, or else it would be drawn
-        pieces = [(piece, table_of(piece)) for piece in scene.furniture]
-        table["furniture"] = [
-            {**given, "magnetization": list(piece.magnetization)} for piece, given in pieces
-        ]
+        drawn = [{"magnetization": list(piece.magnetization)} for piece in scene.furniture]
+        table["furniture"] = [table_of(p) | own for p, own in zip(scene.furniture, drawn, strict=True)]
     return table | {"robot": robots[0] if alone else robots}
 
 

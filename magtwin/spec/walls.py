@@ -416,8 +416,5 @@ def overlap_m(one: Sequence[Vec2] | np.ndarray, other: Sequence[Vec2] | np.ndarr
 @lru_cache(maxsize=256)
 def steel_of_walls(structure: Structure) -> tuple[SourceSpec, ...]:
     """Sources of all walls and doors of a room."""
-    return tuple(
-        source
-        for wall in (*structure.walls, *structure.sides)
-        for source in sources_of_wall(wall, structure.openings(wall))
-    )
+    walls = (*structure.walls, *structure.sides)
+    return sum((sources_of_wall(wall, structure.openings(wall)) for wall in walls), ())

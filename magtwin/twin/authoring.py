@@ -114,10 +114,8 @@ def scene_from_toml(
         checksum = sha256(where)
     else:
         tables = path.tables
-        where, checksum = (
-            FilePath(f"room {tables['name']!r}"),
-            hashlib.sha256(path.to_toml().encode()).hexdigest(),
-        )
+        where = FilePath(f"room {tables['name']!r}")
+        checksum = hashlib.sha256(path.to_toml().encode()).hexdigest()
     scene = read_toml_scene(
         where,
         table=tables,

@@ -347,10 +347,8 @@ def _samples(
         wanted = [name for name in dict.fromkeys((*pose, "wheel_angle", *kept)) if name in run]
         rules: Any = {pose[0]: "linear", pose[1]: "quaternion"}  # it moves between recorded poses
         at = grid(run["t"][0], run["t"][-1], fps)
-        frames, at_frames = (
-            run.select(*wanted).resample(at, interpolation=rules),
-            np.arange(len(at), dtype=float),
-        )
+        frames = run.select(*wanted).resample(at, interpolation=rules)
+        at_frames = np.arange(len(at), dtype=float)
     codes = at_frames.tolist()
     p, q = (frames[name] for name in pose)
     known = np.isfinite(p).all(axis=1) & np.isfinite(q).all(axis=1)

@@ -77,9 +77,8 @@ def plan_toml(path: Path, name: str, scale: float | None = None) -> tuple[str, l
     """
     path, suffix = existing(path, "floor plan"), path.suffix.lower()
     if suffix not in (*READERS, *GRIDS):
-        raise InputError(
-            f"{path}: a floor plan is .svg, .dxf, .geojson, or .pgm or .yaml of an occupancy map"
-        )
+        kinds = ".svg, .dxf, .geojson, or .pgm or .yaml of an occupancy map"
+        raise InputError(f"{path}: a floor plan is {kinds}")
     if scale is not None and not 0 < scale < math.inf:
         raise InputError(f"scale must be above 0 metres per unit, got {scale!r}", parameter="scale")
     if suffix in GRIDS:
@@ -89,9 +88,8 @@ def plan_toml(path: Path, name: str, scale: float | None = None) -> tuple[str, l
     else:
         plan = _plan(READERS[suffix](path), path, scale)
     if len(plan.walls) > MOST_WALLS:
-        raise InputError(
-            f"{path}: {len(plan.walls):,} walls, at most {MOST_WALLS:,}; leave out what is no wall"
-        )
+        count = f"{len(plan.walls):,} walls, at most {MOST_WALLS:,}"
+        raise InputError(f"{path}: {count}; leave out what is no wall")
     with about(f"{path}:"):
         lab = LabSpec(floor=plan.floor, **plan.sides)  # type: ignore[arg-type]
         off = {wall.name for wall in plan.walls if off_floor_m(wall, lab)[1].min() > 0}

@@ -85,9 +85,7 @@ class ClosedLoop:
         drive, dt = self.drive, self.dt
         left = math.exp(-dt / drive.motor_lag_s) if drive.motor_lag_s else 0.0
         radius, separation = (1.0 + error for error in self.wheel_errors)
-        fixed = loop.Drive(
-            *limits(drive, dt),
-            dt=dt,
+        fixed = limits(drive, dt)._replace(
             left_at_end=left,
             left_in_mean=drive.motor_lag_s / dt * (1.0 - left),
             slip=drive.slip_s2_m / dt,

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.run import mapped
-from magtwin.sim.motion.loop import Limits, limited
+from magtwin.sim.motion.loop import Drive, limited
 from magtwin.spec.drive import DriveSpec
 
 Array = NDArray[np.float64]
@@ -64,9 +64,10 @@ def wheel_rates(v: ArrayLike, w: ArrayLike, drive: DriveSpec) -> Array:
     return np.stack([v - side, v + side], axis=-1) / drive.wheel_radius_m
 
 
-def limits(drive: DriveSpec, dt: float) -> Limits:
-    """Limits of a drive for steps of `dt` [s]."""
-    return Limits(
+def limits(drive: DriveSpec, dt: float) -> Drive:
+    """Limits of a drive for steps of `dt` [s], without motors and wheels."""
+    return Drive(
+        dt=dt,
         v_max=drive.v_max,
         w_max=drive.w_max,
         dv=drive.a_max * dt,

@@ -63,18 +63,15 @@ def course_of(scene: Scene, path: DriveInput, speed: float, conditions: Conditio
         told: Metadata = {name: path.metadata[name] for name in kept if name in path.metadata}
         return Course(path, None, speed, {**told, "engine": "replay"})
     engine: Metadata = {} if conditions.engine.name == "kinematic" else {"engine": conditions.engine.name}
-    options: dict[str, Any] = {
-        "duration_s": conditions.duration_s,
-        "footprint_radius_m": robot.footprint_radius_m,
-    }
+    options: dict[str, Any] = {"footprint_radius_m": robot.footprint_radius_m}
+    options["duration_s"] = conditions.duration_s
     if isinstance(path, Path):
         name = named if isinstance(named, str) else type(named).__name__
         plain = "follower" if _is_custom(named) else name  # the plan of a custom controller is not used
         room = conditions.obstacles
         loop = loop_along(path, robot.drive, speed=speed, controller=plain, obstacles=room, **options)
-        return Course(
-            path, loop, speed, {"path": path.name, "controller": name, "speed_m_s": float(speed), **engine}
-        )
+        told = {"path": path.name, "controller": name, "speed_m_s": float(speed)}
+        return Course(path, loop, speed, {**told, **engine})
     if isinstance(path, Commands):
         loop = loop_by_commands(path.rows, robot.drive, start=scene.start, **options)
         told = {"path": path.name, "controller": "commands"}

@@ -101,7 +101,9 @@ class SteppedRobots:
             raise InputError(
                 f"robot {scene.robot.name!r} has a plant, which only runs simulate; leave it out"
             )
-        self._code = _compiled()
+        self._code: ModuleType | None = None  # where numba does not work; the bytes are the same
+        with suppress(ImportError):
+            self._code = LOOPS.open()
         self._moved = Robots([loop_by_commands(STAND, scene.robot.drive)] * count, obstacles)
         self._record = np.zeros((count, loop.RECORD, self._steps))
         self._t, self._angle, self._twist = np.zeros(count), np.zeros((count, 2)), np.zeros((count, 2))
@@ -308,10 +310,3 @@ def _stacked_moments(moments: Sequence[Moment]) -> Moment:
 
 
 _PARTS = tuple(Moment.__dataclass_fields__)
-
-
-def _compiled() -> ModuleType | None:
-    """The compiled loop; None for plain Python, where numba does not work. The bytes are the same."""
-    with suppress(ImportError):
-        return LOOPS.open()
-    return None

@@ -157,10 +157,8 @@ def read_source(prim: Usd.Prim, *, name: str | None = None, local: bool = False)
             f"{place(prim)}: a magnetic source below a PointInstancer has no single place; reference it "
             "at its place, as an instance if needed"
         )
-    figures = {
-        key: plain_value(prim.GetAttribute(attribute_name("source", key)))
-        for key in ("moment", "magnetization", "susceptibility")
-    }
+    keys = ("moment", "magnetization", "susceptibility")
+    figures = {key: plain_value(prim.GetAttribute(attribute_name("source", key))) for key in keys}
     p, q, scale = read_transform(prim, local=local)
     with about(f"{place(prim)}:"):
         spec: dict[str, Any] = {"name": name or prim.GetName(), "p_world": p, "shape": shape}
@@ -248,10 +246,8 @@ def read_transform(prim: Usd.Prim, *, local: bool = False) -> Transform:
         values = {op.GetOpName(): value for op in ops if (value := op.Get()) is not None}
         turn = values.get("xformOp:orient", Gf.Quatd(1))
         turn = turn if isinstance(turn, Gf.Quatd) else Gf.Quatd(turn).GetNormalized()
-        p, scale = (
-            Gf.Vec3d(values.get(f"xformOp:{name}", Gf.Vec3d(default)))
-            for name, default in (("translate", 0), ("scale", 1))
-        )
+        p = Gf.Vec3d(values.get("xformOp:translate", Gf.Vec3d(0)))
+        scale = Gf.Vec3d(values.get("xformOp:scale", Gf.Vec3d(1)))
         if min(scale) > 0:
             return _vec3(p), _quat(turn), _vec3(scale)
     matrix = xformable.GetLocalTransformation() if local else cache.GetLocalToWorldTransform(prim)

@@ -164,17 +164,15 @@ def harmonic_arrays(field: AnomalyMap) -> dict[str, NDArray] | None:
 
 def harmonic_values(harmonic: Mapping[str, NDArray] | None) -> dict[str, Any]:
     """Values of the attributes of a harmonic field, by name; None if there is none."""
-    return {
-        attribute_name("harmonic", name): _usd_array(harmonic[name], shape) if harmonic else None
-        for name, shape in HARMONIC.items()
-    }
-
-
-def _usd_array(array: NDArray, shape: tuple[int, ...]) -> Any:
-    """An array of a harmonic field as the type of its attribute; -1 in `shape` is any number of rows."""
-    if shape in ((3, 3), (3,)):
-        return (Gf.Matrix3d if len(shape) == 2 else Gf.Vec3d)(*array.ravel().tolist())
-    return Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(array))
+    values: dict[str, Any] = {}
+    for name, shape in HARMONIC.items():
+        value: Any = harmonic[name] if harmonic else None
+        if value is not None and -1 in shape:  # any number of rows
+            value = Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(value))
+        elif value is not None:
+            value = (Gf.Matrix3d if len(shape) == 2 else Gf.Vec3d)(*value.ravel().tolist())
+        values[attribute_name("harmonic", name)] = value
+    return values
 
 
 def grid_numbers(grid: Grid) -> NDArray[np.float64]:
