@@ -188,11 +188,10 @@ def check_stands(piece: FurnitureSpec, lab: LabSpec) -> None:
     beyond = -float(lab.inside_m(world[:, :2]).min()) - edge
     if beyond > 1e-6:
         size, hint = np.ptp(world, axis=0), ""
-        floor = "floor" if lab.floor else "floor_m"
         x, y = (side + 2 * edge for side in lab.floor_m)
-        slab = f"{x:g} x {y:g} m about the origin"
+        floor, slab = "floor_m", f"{x:g} x {y:g} m about the origin"
         if lab.floor:
-            slab = f"the floor of {lab.size_text}, and {edge:g} m around it"
+            floor, slab = "floor", f"the floor of {lab.size_text}, and {edge:g} m around it"
         if any(part.faces for part in piece.parts) and size.max() > HUGE_M:
             hint = f"; it is {size[0]:.3g} x {size[1]:.3g} m: is its file in mm? then scale = 0.001"
         raise InputError(

@@ -29,6 +29,7 @@ from magtwin.usd.robot import load_robot as load_robot
 from magtwin.usd.robot import urdf_of
 from magtwin.usd.schema import NOUNS, prims_with
 from magtwin.usd.sensors import (
+    ON_ROOT,
     define_battery,
     define_drive,
     define_footprint,
@@ -207,9 +208,8 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
         define_drive(robot, drive)
         notes += found
     notes += stand_on_floor(robot, read_drive(robot))
-    for noun, spec in (("platform", settings.platform), ("mocap", settings.mocap)):
-        define_on_root(robot, noun, spec)
-    define_on_root(robot, "plant", settings.plant.spec)
+    for noun in ON_ROOT:
+        define_on_root(robot, noun, settings.plant.spec if noun == "plant" else getattr(settings, noun))
     define_battery(stage, _free(links, _base(robot), "battery"), settings.battery)
     sensors: tuple[tuple[str, Any, Any, Any], ...] = (
         ("imu", settings.imu, ImuSpec(), define_imu),

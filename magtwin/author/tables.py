@@ -113,11 +113,8 @@ def table_of_robot(placed: PlacedRobot) -> Table:
     """A robot as its asset, and what differs from it."""
     robot, asset = placed.robot, load_robot(placed.robot.asset)
     known = shipped("robots") / robot.asset.stem / robot.asset.name
-    table: Table = {
-        "name": robot.name,
-        "asset": robot.asset.stem if known == robot.asset else str(robot.asset),
-        "start": list(placed.start),
-    }
+    named = robot.asset.stem if known == robot.asset else str(robot.asset)
+    table: Table = {"name": robot.name, "asset": named, "start": list(placed.start)}
     if placed.path:
         table["path"] = str(placed.path)
     if robot.footprint_radius_m != asset.footprint_radius_m:

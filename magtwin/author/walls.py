@@ -131,9 +131,7 @@ def check_not_in_walls(
     for name, outline in placed:
         if name.startswith(f"{FURNITURE}/"):
             parts.setdefault(name.split("/")[3], []).append(outline)
-    upper = {
-        piece.name: [_outline(piece, part) for part in piece.parts if not part.faces] for piece in pieces
-    }
+    upper = {p.name: [_outline(p, part) for part in p.parts if not part.faces] for p in pieces}
     for piece, standing in parts.items():
         whole = Obstacles((piece,), (np.concatenate(standing),)).outlines  # a table's legs are beside a side
         outlines = [*standing, *upper.get(piece, ())]  # with what robots pass below, such as its top

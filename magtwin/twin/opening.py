@@ -334,14 +334,9 @@ def _with_magnetometer(robot: RobotSpec, network: str | FilePath | None, kind: K
     if network is not None:
         if FilePath(network).is_dir():
             raise InputError(f"{network}: a folder; name the weights file in it")
-        physical = str(network) == "none"
-        spec = dataclasses.replace(
-            spec,
-            kind="physical" if physical else "neural",
-            network=None if physical else FilePath(network).resolve(),
-            network_sha256="",
-            inputs=(),
-        )
+        file = None if str(network) == "none" else FilePath(network).resolve()
+        named: Any = {"kind": "physical" if file is None else "neural", "network": file}
+        spec = dataclasses.replace(spec, **named, network_sha256="", inputs=())
     if kind is not None:
         if kind != "neural" and network is not None and str(network) != "none":
             raise InputError(f"a {kind!r} magnetometer has no network; drop `magnetometer` or `network`")

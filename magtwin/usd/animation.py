@@ -261,9 +261,8 @@ def _stand(stage: Usd.Stage, default: Usd.Prim, name: str) -> _Stand:
     if not default:
         raise InputError(f"{place(prim)}: the stage has no default prim, which holds the run; set one")
     if prim.IsInstance() or prim.IsInstanceProxy():
-        raise InputError(
-            f"{place(prim)}: the robot is an instance, whose wheels cannot turn; make it not instanceable"
-        )
+        text = "the robot is an instance, whose wheels cannot turn; make it not instanceable"
+        raise InputError(f"{place(prim)}: {text}")
     cache = UsdGeom.XformCache()
     if cache.GetParentToWorldTransform(prim) != Gf.Matrix4d(1):
         raise InputError(

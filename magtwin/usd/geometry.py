@@ -250,20 +250,18 @@ def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
 def read_colour_scale(stage: Usd.Stage) -> ColourScale | None:
     """The scale of the first visible heat map of a stage; None if there is none."""
     for prim in _prims(stage):
-        metadata = prim.GetCustomDataByKey("magtwin")
-        if not isinstance(metadata, dict) or "colourMap" not in metadata:
+        data = prim.GetCustomDataByKey("magtwin")
+        shown = isinstance(data, dict) and "colourMap" in data
+        if not shown or UsdGeom.Imageable(prim).ComputeVisibility() == "invisible":
             continue
-        if UsdGeom.Imageable(prim).ComputeVisibility() != "invisible":
-            name, unit = metadata["colourMap"], metadata.get("unit")
-            least, greatest = metadata.get("least"), metadata.get("greatest")
-            texts = isinstance(name, str) and isinstance(unit, str)
-            numbers = [x for x in (least, greatest) if isinstance(x, int | float) and np.isfinite(x)]
-            if not texts or len(numbers) < 2:
-                raise InputError(
-                    f"{place(prim)}: the colour scale in its customData wants colourMap and unit as texts, "
-                    "least and greatest as numbers; correct it"
-                )
-            return ColourScale(str(name), numbers[0], numbers[1], str(unit), str(prim.GetPath()))
+        texts = [x for x in map(data.get, ("colourMap", "unit")) if isinstance(x, str)]
+        numbers = [x for x in map(data.get, ("least", "greatest")) if isinstance(x, int | float)]
+        if len(texts) < 2 or len(numbers) < 2 or not np.isfinite(numbers).all():
+            raise InputError(
+                f"{place(prim)}: the colour scale in its customData wants colourMap and unit as texts, "
+                "least and greatest as numbers; correct it"
+            )
+        return ColourScale(texts[0], numbers[0], numbers[1], texts[1], str(prim.GetPath()))
     return None
 
 

@@ -100,10 +100,8 @@ class Newton:
                 rates = []
                 for _ in range(parts):
                     mean = [b + in_mean * (a - b) for a, b in zip(wheels, target, strict=True)]
-                    wheels = (
-                        target[0] + left * (wheels[0] - target[0]),
-                        target[1] + left * (wheels[1] - target[1]),
-                    )
+                    (v, w), (v0, w0) = wheels, target
+                    wheels = v0 + left * (v - v0), w0 + left * (w - w0)
                     rolls = mean[0] * radius, mean[1] * radius / separation
                     rates.append(wheel_rates(*rolls, drive).tolist())
                 if target == (0.0, 0.0) and abs(wheels[0]) < REST_M_S and abs(wheels[1]) < rest_w:

@@ -90,11 +90,9 @@ def limiter(drive: DriveSpec, dt: float) -> Callable[[float, float, float, float
 def draw_wheel_errors(drive: DriveSpec, rng: np.random.Generator) -> tuple[float, float]:
     """Relative errors of the wheels' radius and separation in one run: the session's, plus a draw."""
     radius, separation = rng.standard_normal(2).tolist()
-    shared = drive.wheel_errors
-    return (
-        shared[0] + drive.wheel_radius_error_std * radius,
-        shared[1] + drive.wheel_separation_error_std * separation,
-    )
+    radius *= drive.wheel_radius_error_std
+    separation *= drive.wheel_separation_error_std
+    return drive.wheel_errors[0] + radius, drive.wheel_errors[1] + separation
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,18 +25,15 @@ from magtwin.sim.motion.engine import Travel
 from magtwin.sim.runs.driving import Course, Metadata, Trip, course_of, drive, labelled
 from magtwin.sim.runs.sensing import Conditions, Sensing, streams
 from magtwin.sim.runs.simulate import Sensed, check_run, read_all, readings, sense_all
+from magtwin.spec.drive import DRAWN
 from magtwin.spec.scene import Scene
 
 BLOCK = 16
 """Runs made at a time: 130,000 readings of a minute each, 0.1 GB, and work for every thread."""
 
 
-UNPLANNED: dict[str, Any] = {
-    **dict.fromkeys(("wheel_radius_error_std", "wheel_separation_error_std", "odometry_noise_std"), 0.0),
-    "wheel_errors": (0.0, 0.0),
-    "odometry_scale": (1.0, 1.0),
-}
-"""Figures of a drive on which no plan depends."""
+UNPLANNED: dict[str, Any] = {"wheel_errors": (0.0, 0.0), "odometry_scale": (1.0, 1.0)}
+"""Figures of a drive on which no plan depends, beside `DRAWN`."""
 
 PLANNED = 1 << 27
 """Bytes of plans that are kept, beside the last: 1,000 of a minute each, or none of a day."""
@@ -240,7 +237,7 @@ class Runs(Summarized, Sequence[Run]):
         if isinstance(job.path, Run):
             return course_of(job.scene, job.path, job.speed, job.conditions)
         robot = job.scene.robot
-        alike = replace(robot.drive, **UNPLANNED), robot.footprint_radius_m
+        alike = replace(robot.drive, **UNPLANNED, **dict.fromkeys(DRAWN, 0.0)), robot.footprint_radius_m
         key = (job.path, job.speed, alike, job.scene.start, job.conditions)
         if key in self._planned:
             return self._planned[key]

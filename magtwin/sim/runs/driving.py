@@ -123,10 +123,8 @@ def labelled(label: str) -> Iterator[None]:
         raise InputError(f"{label}: {error}", parameter=error.parameter) from error
 
 
-def _is_custom(controller: str | Controller) -> bool:
-    if not isinstance(controller, str):
-        return True
-    return controller not in CONTROLLERS and controller in CUSTOM_CONTROLLERS
+def _is_custom(named: str | Controller) -> bool:
+    return not isinstance(named, str) or (named not in CONTROLLERS and named in CUSTOM_CONTROLLERS)
 
 
 def _controller(trip: Trip, conditions: Conditions) -> Controller | None:

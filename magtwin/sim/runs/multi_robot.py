@@ -112,8 +112,5 @@ def _nearest(name: str, near: Iterable[Approach]) -> dict[str, str | float]:
         return {}
     least = min(own, key=lambda approach: approach.clearance_m)
     other = next(other for other in least.names if other != name)
-    return {
-        "nearest_robot": other,
-        "nearest_clearance_m": round(least.clearance_m, 6),
-        "nearest_t_s": least.t_s,
-    }
+    clearance_m = round(least.clearance_m, 6)
+    return {"nearest_robot": other, "nearest_clearance_m": clearance_m, "nearest_t_s": least.t_s}

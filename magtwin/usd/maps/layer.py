@@ -4,7 +4,6 @@ import hashlib
 import math
 import os
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -236,13 +235,7 @@ def _values(field: AnomalyMap) -> dict[str, Any]:
     return {**named, **texts_of(field), **harmonic_values(harmonic)}
 
 
-def _checksum(
-    values: NDArray,
-    valid: NDArray,
-    variance: NDArray,
-    harmonic: Mapping[str, NDArray] | None,
-    grid: NDArray,
-) -> str:
+def _checksum(values: NDArray, valid: NDArray, variance: NDArray, harmonic: Any, grid: NDArray) -> str:
     """SHA-256 over the bytes of the arrays: float32, one byte a flag, float64; little-endian."""
     digest = hashlib.sha256(values.astype("<f4").tobytes())
     digest.update(valid.astype(np.uint8).tobytes())
