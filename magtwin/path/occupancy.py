@@ -82,13 +82,9 @@ class OccupancyGrid(Summarized):
         rows, columns = self.cells.shape
         share = [(self.cells == value).mean() for value in (FREE, OCCUPIED, UNKNOWN)]
         x, y = self.origin_m
-        return Summary(
-            f"OccupancyGrid: {columns} x {rows} cells of {self.resolution_m:g} m",
-            (
-                ("cells", "{:.1%} free, {:.1%} occupied, {:.1%} unknown".format(*share)),
-                ("origin", f"x {x:g}, y {y:g} m"),
-            ),
-        )
+        title = f"OccupancyGrid: {columns} x {rows} cells of {self.resolution_m:g} m"
+        cells = "{:.1%} free, {:.1%} occupied, {:.1%} unknown".format(*share)
+        return Summary(title, (("cells", cells), ("origin", f"x {x:g}, y {y:g} m")))
 
 
 def occupancy_of(room: Room, *, resolution_m: float | None = None) -> OccupancyGrid:

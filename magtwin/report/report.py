@@ -51,20 +51,15 @@ class Report(Summarized):
             notes |= {name: f.note} if f.note else {}
         facts = {key(name): value for name, value in self.metadata.items()}
         content = {"title": self.title} | ({"verdict": self.verdict} if self.verdict else {})
-        return json.dumps(
-            jsonable(content | {"figures": figures, "notes": notes, "metadata": facts}), indent=2
-        )
+        content |= {"figures": figures, "notes": notes, "metadata": facts}
+        return json.dumps(jsonable(content), indent=2)
 
     def _summary(self) -> Summary:
         """The figures; a notebook also shows the metadata."""
         metadata = [(str(name), str(value)) for name, value in self.metadata.items()]
         count = f" ({len(self.figures)} figures)" if len(self.figures) >= LINES else ""
-        return Summary(
-            f"{self.title}{count}",
-            (("verdict", self.verdict), *((f.name, _text(f)) for f in self.figures)),
-            ("fact", "value"),
-            metadata,
-        )
+        rows = (("verdict", self.verdict), *((f.name, _text(f)) for f in self.figures))
+        return Summary(f"{self.title}{count}", rows, ("fact", "value"), metadata)
 
 
 def key(name: str, unit: str = "") -> str:

@@ -75,10 +75,8 @@ def scene_with_robot(
         asset.parent.mkdir(parents=True, exist_ok=True)
         build_robot(file, settings, asset)
     elif magnetometer or controllers or packages or arguments:
-        raise InputError(
-            f"{file}: an asset has its magnetometer and drive already; give its URDF instead",
-            parameter="robot",
-        )
+        text = "an asset has its magnetometer and drive already; give its URDF instead"
+        raise InputError(f"{file}: {text}", parameter="robot")
     scale, made = 1.0, load_robot(asset)
     if made.footprint_radius_m > HUGE_M / 2:
         raise InputError(
@@ -90,9 +88,8 @@ def scene_with_robot(
         sizes = made.footprint_radius_m / ROOM_RADIUS_M, made.drive.turning_radius_m / ROOM_TURN_M
         scale = max(1.0, *sizes)
         spec, name = shipped("scenes", "starter.toml"), name or stem
-    return _with_path(
-        scene_from_toml(spec, robot=asset, name=name, scale=scale, workshop=workshop, **choices)
-    )
+    scene = scene_from_toml(spec, robot=asset, name=name, scale=scale, workshop=workshop, **choices)
+    return _with_path(scene)
 
 
 def _with_path(scene: Scene) -> Scene:

@@ -61,10 +61,8 @@ def with_plant(twin: Twin, plant: PlantSpec | str | None) -> Twin:
     if plant is None:
         return twin
     if twin.session:
-        raise InputError(
-            f"the twin is in session {twin.session['session']!r} already; give `plant` before the session",
-            parameter="plant",
-        )
+        text = f"the twin is in session {twin.session['session']!r} already; give `plant` before the session"
+        raise InputError(text, parameter="plant")
     if not isinstance(plant, PlantSpec | str):
         raise InputError(f"plant must be a name or a PlantSpec, got {plant!r}", parameter="plant")
     text = plant if isinstance(plant, str) else plant_text(plant)
@@ -98,9 +96,8 @@ def trained_on(twin: Twin) -> bool:
     """Whether the network of a twin was trained on its robot, plant and kind of session."""
     network, robot = twin.magnetometer, twin.scene.robot
     plant = {} if robot.plant == PlantSpec() else {"plant": OF_SCENE}
-    return network is not None and network.knows(
-        {**robot_metadata(robot), **plant, **twin.session, **twin.metadata}
-    )
+    known = {**robot_metadata(robot), **plant, **twin.session, **twin.metadata}
+    return network is not None and network.knows(known)
 
 
 def room_of(twin: Twin) -> Room:

@@ -118,15 +118,14 @@ class Twin(Summarized):
         sensor += f", plant {plant}" if plant else ""
         more = f", and {len(self.scene.others)} more robots" if self.scene.others else ""
         network = self.magnetometer._summary().title.partition(" ")[2] if self.magnetometer else "none"
-        return Summary(
-            f"Twin {self.scene.name}: floor {self.scene.lab.size_text}, {len(self.obstacles)} obstacles",
-            (
-                ("robot", sensor + more + (f", session {self.session['session']}" if self.session else "")),
-                ("map", field.title.partition(" ")[2]),
-                ("network", network),
-                ("file", str(self.scene_file) if self.stage is None else "none: opened from a Scene"),
-            ),
-        )
+        rows = {
+            "robot": sensor + more + (f", session {self.session['session']}" if self.session else ""),
+            "map": field.title.partition(" ")[2],
+            "network": network,
+            "file": str(self.scene_file) if self.stage is None else "none: opened from a Scene",
+        }
+        title = f"Twin {self.scene.name}: floor {self.scene.lab.size_text}, {len(self.obstacles)} obstacles"
+        return Summary(title, tuple(rows.items()))
 
 
 def scene_in(place: Any, what: str = "scene must be") -> Any:

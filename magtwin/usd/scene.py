@@ -295,9 +295,8 @@ def earth_in(stage: Usd.Stage, lab: Lab) -> tuple[EarthFieldSpec | None, list[st
     free = [(p, e) for p, e in found if nearest_lab(p, labs_on(stage)) is None]
     for those in (own, [] if own else free):
         if len(those) > 1:
-            raise InputError(
-                f"{place(those[1][0])}: a second Earth's field; the first is {those[0][0].GetPath()}"
-            )
+            first = those[0][0].GetPath()
+            raise InputError(f"{place(those[1][0])}: a second Earth's field; the first is {first}")
     if not (own or free):
         return None, []
     chosen, earth = (own or free)[0]
@@ -437,9 +436,8 @@ def _read_placed(prim: Usd.Prim, check_network: bool, notes: list[str]) -> Place
     world = UsdGeom.XformCache().GetLocalToWorldTransform(prim)
     rows = np.array(world)[:3, :3]
     if np.abs(rows @ rows.T - np.eye(3)).max() > SAME or rows[0] @ np.cross(rows[1], rows[2]) < 0:
-        raise InputError(
-            f"{place(prim)}: the robot is scaled or mirrored; clear its scale and those above it"
-        )
+        text = "the robot is scaled or mirrored; clear its scale and those above it"
+        raise InputError(f"{place(prim)}: {text}")
     robot = read_robot(prim)
     sensor, network = only_prim_with(prim, "magnetometer"), robot.magnetometer.network
     neural = check_network and robot.magnetometer.kind == "neural"
@@ -450,8 +448,7 @@ def _read_placed(prim: Usd.Prim, check_network: bool, notes: list[str]) -> Place
     if UsdGeom.XformCache().GetParentToWorldTransform(prim) != Gf.Matrix4d(1):
         p, q, _ = read_transform(prim)
     if rows[2, 2] < UPRIGHT or abs(p[2]) > LEVEL_M:
-        notes.append(
-            f"{place(prim)}: stands {p[2]:g} m above the floor or tilted; a run starts it on the floor"
-        )
+        text = f"stands {p[2]:g} m above the floor or tilted; a run starts it on the floor"
+        notes.append(f"{place(prim)}: {text}")
     with about(f"{place(prim)}:"):
         return PlacedRobot(robot=robot, start=(p[0], p[1], float(yaw_from_quat(q))), path=read_path(prim))
