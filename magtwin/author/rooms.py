@@ -320,7 +320,7 @@ class Room(Summarized):
         """
         values = {"name": self._free("wall", "wall", first=0), **more, "from": start, "to": end}
         from_values(WallTable, values, f"wall {values['name']!r}")
-        return self._adding("wall", values)._standing()
+        return self._adding("wall", values)
 
     def door(self, at_m: float, wall: str | None = None, **more: Unpack[DoorKeys]) -> "Room":
         """Add a door that is open, or opens, to a wall.
@@ -458,8 +458,8 @@ class Room(Summarized):
         robots = self.table.get("robot", ())
         if not robots:
             raise InputError(f'room {self.table["name"]!r} has no robot; add one: .robot("turtlebot4")')
-        alone = len(robots) == 1 and robots[0]["name"] == Path(robots[0].get("asset", "")).stem
-        alone = alone or (len(robots) == 1 and "urdf" in robots[0])
+        first, alone = robots[0], len(robots) == 1
+        alone = alone and ("urdf" in first or first["name"] == Path(first.get("asset", "")).stem)
         single = {key: value for key, value in robots[0].items() if key != "name"}
         order = sorted(self.table, key=lambda key: isinstance(self.table[key], dict | list))
         tables = {key: self.table[key] for key in order}
@@ -474,7 +474,7 @@ class Room(Summarized):
         earth = table["earth"]
         rows = [
             ("furniture", listed([piece["name"] for piece in table.get("furniture", ())], 80)),
-            ("walls", listed([f"{wall['name']}" for wall in table.get("wall", ())], 80)),
+            ("walls", listed([wall["name"] for wall in table.get("wall", ())], 80)),
             ("robots", listed([robot["name"] for robot in table.get("robot", ())], 80) or "none yet"),
             ("earth", f"{earth['latitude_deg']:g}, {earth['longitude_deg']:g} deg, {earth['date']}"),
         ]
@@ -502,11 +502,7 @@ class Room(Summarized):
             wall = walls[-1]["name"]
         values = {"name": self._free(section, section, first=0), **more, "wall": wall, "at_m": at_m}
         from_values(cls, values, f"{section} {values['name']!r}")
-        return self._adding(section, values)._standing()
-
-    def _standing(self) -> "Room":
-        self._lab()
-        return self
+        return self._adding(section, values)
 
     def _free(self, section: str, stem: str, *, first: int = 1) -> str:
         """A name that no table of the section has: box, box_2; or wall_0, wall_1."""
@@ -520,7 +516,10 @@ class Room(Summarized):
             raise InputError(
                 f"two things of [[{section}]] are called {values['name']!r}; give each its own name"
             )
-        return self._with(**{section: [*held, plain(values)]})
+        room = self._with(**{section: [*held, plain(values)]})
+        if section in ("wall", "door", "window"):
+            room._lab()  # refuses what cannot stand
+        return room
 
     def _with(self, **tables: Any) -> "Room":
         room = Room.__new__(Room)

@@ -262,24 +262,18 @@ def check_above_floor(robot: RobotSpec, where: str) -> None:
 
 def _scaled(table: Mapping[str, Any], scale: float) -> dict[str, Any]:
     """The table of a scene whose floor is `scale` times as wide, with all things in the same part of it."""
-
-    def placed(thing: Mapping[str, Any]) -> dict[str, Any]:
-        x, y, z = thing["p_world"]
-        return {**thing, "p_world": [x * scale, y * scale, z]}
-
+    factors: dict[str, Any] = {**dict.fromkeys(("from", "to", "at_m"), scale), "p_world": (scale, scale, 1.0)}
     lab = dict(table.get("lab", {}))
     if "floor_m" in lab:
         lab["floor_m"] = [round(side * scale, 3) for side in lab["floor_m"]]
     if "floor" in lab:
         lab["floor"] = [[c * scale for c in corner] for corner in lab["floor"]]
-    things = {key: [placed(thing) for thing in table[key]] for key in ("furniture", "source") if key in table}
-    for key in ("wall", "door", "window"):
-        places = ("from", "to", "at_m")
-        things[key] = [
-            {k: (np.multiply(v, scale).tolist() if k in places else v) for k, v in thing.items()}
-            for thing in table.get(key, [])
-        ]
-    return {**table, "lab": lab, **things}
+
+    def placed(thing: Mapping[str, Any]) -> dict[str, Any]:
+        return {k: np.multiply(v, factors[k]).tolist() if k in factors else v for k, v in thing.items()}
+
+    sections = [key for key in ("furniture", "source", "wall", "door", "window") if key in table]
+    return {**table, "lab": lab, **{key: [placed(thing) for thing in table[key]] for key in sections}}
 
 
 def _robot(

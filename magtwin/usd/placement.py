@@ -17,14 +17,13 @@ from pxr import Gf, Sdf, Usd, UsdGeom
 from magtwin.errors import InputError
 from magtwin.usd.schema import has_api, only_prim_with, place, prims_with
 from magtwin.usd.sensors import MAP_RELATIONSHIP
+from magtwin.usd.units import said
 
 SAME = 1e-6
 """Largest relative error of a length that counts as none."""
 
 UPRIGHT = 1 - 1e-9
 """Cosine of the tilt of a lab that counts as level: 0.003 deg."""
-
-UNITS = "{:g} m a unit and {} up"
 
 _PLACED = "xformOp:transform:magtwinLab"
 
@@ -282,7 +281,7 @@ def _refused(lab: Lab, metres: float) -> InputError:
     stage = lab.root.GetStage()
     z_up = _level(stage)[2, 2] == 1
     if not (UsdGeom.LinearUnitsAre(metres, UsdGeom.LinearUnits.meters) and z_up):
-        units = UNITS.format(metres, UsdGeom.GetStageUpAxis(stage))
+        units = said((metres, UsdGeom.GetStageUpAxis(stage)))
         turn = "" if z_up else " and rotateX -90"
         return InputError(
             f"{place(lab.root)}: the stage has {units}; magtwin reads metres with Z up, and USD converts "

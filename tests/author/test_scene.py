@@ -1,8 +1,8 @@
 """A Scene through its layers and back; what cannot be a scene is refused by file and prim."""
 
-import importlib.util
 import math
 import re
+import runpy
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -364,12 +364,7 @@ def test_robots_that_read_different_maps_are_refused_by_prim(own_parts, tmp_path
 
 def build_lab(folder: Path) -> Path:
     """`scenes/build.py` run for another folder."""
-    script = importlib.util.spec_from_file_location("build_scenes", shipped("scenes", "build.py"))
-    assert script is not None
-    assert script.loader is not None
-    module = importlib.util.module_from_spec(script)
-    script.loader.exec_module(module)
-    return module.build(folder)
+    return runpy.run_path(str(shipped("scenes", "build.py")))["build"](folder)
 
 
 def without_ways(layer: Path) -> str:
