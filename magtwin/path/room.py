@@ -259,12 +259,9 @@ def _covering(room: Room) -> Path:
     for count, cell in found.closed:
         if (area := count * free.step_m**2) > LITTLE_M2:
             x, y = free.places(cell)
-            warnings.warn(
-                f"path {COVERAGE} cannot enter {area:.1f} m2 of the free floor about ({x:.2f}, {y:.2f}): "
-                f"{_closed_by(room, x, y)}",
-                MismatchWarning,
-                stacklevel=4,
-            )
+            part = f"{area:.1f} m2 of the free floor about ({x:.2f}, {y:.2f})"
+            text = f"path {COVERAGE} cannot enter {part}: {_closed_by(room, x, y)}"
+            warnings.warn(text, MismatchWarning, stacklevel=4)
     path = Path(COVERAGE, free.places(found.cells), swept=round(found.share, 3))
     if (error := room.refusal(path)) is not None:
         raise error

@@ -211,11 +211,8 @@ def plant_of(text: str, *, which: int = 0) -> PlantSpec:
         return from_table(PlantSpec, given, "plant")
     name, colon, seed = text.partition(":")
     if colon and not (seed.isascii() and seed.isdigit() and len(seed) <= MOST_DIGITS):
-        raise InputError(
-            f"plant must be NAME or NAME:SEED, SEED a whole number from 0 up with at most {MOST_DIGITS} "
-            f"digits; got {text[:60]!r}",
-            parameter="plant",
-        )
+        seeds = f"SEED a whole number from 0 up with at most {MOST_DIGITS} digits"
+        raise InputError(f"plant must be NAME or NAME:SEED, {seeds}; got {text[:60]!r}", parameter="plant")
     return draw_plant(name, int(seed or 0), which=which)
 
 

@@ -170,9 +170,7 @@ def _twin_of(
     tracking_error: bool = True,
     again: str = SURVEY_SCENE,
 ) -> Twin:
-    """The twin of an opened scene; as for `open_twin`, what is known of its files, and how to survey
-    it again.
-    """
+    """The twin of an opened scene; `again` is how to survey it again, and others as for `open_twin`."""
     from magtwin.usd.layers import layer_sha256
 
     read = stage.scene.with_robots(lambda k, robot: _with_magnetometer(robot, network, magnetometer))
@@ -198,10 +196,8 @@ def _twin_of(
     twin = Twin(read, stage.file, field, predictor, obstacles, metadata, platforms, model_error, opened=stage)
     twin = _with_network(twin if tracking_error else without_tracking_error(twin))
     LOG.info("opened %s: map %s, %d obstacles", read.name, field.name, len(obstacles))
-    if predictor and network is not None:
-        named = {**twin.metadata, "network_file": FilePath(network).as_posix()}
-        return dataclasses.replace(twin, metadata=named)
-    return twin
+    named = {"network_file": FilePath(network).as_posix()} if predictor and network is not None else {}
+    return dataclasses.replace(twin, metadata={**twin.metadata, **named})
 
 
 def _stale(stage: "OpenedScene", again: str) -> str:

@@ -51,11 +51,8 @@ MOST_RUNS = 1_000_000
 def check_count(count: int) -> None:
     """Refuse more runs than one sweep makes."""
     if count > MOST_RUNS:
-        raise InputError(
-            f"{count:,} runs are too many for one sweep (at most {MOST_RUNS:,}); make several, each with "
-            "another `seed`",
-            parameter="count",
-        )
+        text = f"{count:,} runs are too many for one sweep (at most {MOST_RUNS:,})"
+        raise InputError(f"{text}; make several, each with another `seed`", parameter="count")
 
 
 def sweep(

@@ -170,10 +170,8 @@ def open_scene(
     else:
         path = Path(path)
         if path.suffix.lower() == ".usdz":
-            raise InputError(
-                f"{path}: files inside a package cannot be read; unpack it with `magtwin export "
-                f"{quote(str(path))} --out DIR` and give the layer in DIR"
-            )
+            way = f"unpack it with `magtwin export {quote(str(path))} --out DIR` and give the layer in DIR"
+            raise InputError(f"{path}: files inside a package cannot be read; {way}")
         stage = open_stage(path)
     where = lab_on(stage, lab)
     several, pose = len(labs_on(stage)) > 1, pose_of(where)
@@ -391,17 +389,13 @@ def use_map(
         if Path(layer.ComputeAbsolutePath(name)).resolve() == old
     ]
     if not held:
-        raise InputError(
-            f"{opened.file}: the map {old} is no sublayer of this stage, so it cannot be replaced here; "
-            "survey the stage that has it as a sublayer",
-            parameter="adopt",
-        )
+        text = f"the map {old} is no sublayer of this stage, so it cannot be replaced here"
+        way = "survey the stage that has it as a sublayer"
+        raise InputError(f"{opened.file}: {text}; {way}", parameter="adopt")
     if not any(map_layer.resolve().is_relative_to(folder) for folder in folders_of(opened.file)):
-        raise InputError(
-            f"{map_layer}: is not in the folder of {opened.file}, so the stage may not name it; write the "
-            f"map into {opened.file.resolve().parent}",
-            parameter="adopt",
-        )
+        text = f"is not in the folder of {opened.file}, so the stage may not name it"
+        way = f"write the map into {opened.file.resolve().parent}"
+        raise InputError(f"{map_layer}: {text}; {way}", parameter="adopt")
     if dry:
         return
     written = written or map_layer

@@ -39,11 +39,9 @@ def read_grid(
     yaml_file = path if path.suffix.lower() in (".yaml", ".yml") else path.with_suffix(".yaml")
     table = _yaml(yaml_file) if yaml_file.exists() else {}
     if not table and scale is None:
-        raise InputError(
-            f"{path}: a map without a scale: no {yaml_file.name} is beside it; give that file, or `scale=M`, "
-            "metres per cell",
-            parameter="scale",
-        )
+        way = "give that file, or `scale=M`, metres per cell"
+        text = f"a map without a scale: no {yaml_file.name} is beside it; {way}"
+        raise InputError(f"{path}: {text}", parameter="scale")
     picture = yaml_file.parent / str(table["image"]) if path == yaml_file else path
     cells = _picture(existing(picture, "picture of a map"))
     step = scale or _number(table, "resolution", yaml_file)

@@ -121,11 +121,9 @@ def _plan(drawing: Drawing, path: Path, scale: float | None) -> Plan:
     if metres is None:
         raise InputError(f"{path}: a plan without a scale: {drawing.stated}; {way}", parameter="scale")
     if not SIZE_M[0] <= metres * size.max() <= SIZE_M[1]:
-        raise InputError(
-            f"{path}: would be {metres * size[0]:.4g} x {metres * size[1]:.4g} m large, since "
-            f"{drawing.stated if scale is None else f'scale is {scale:g}'}; {way}",
-            parameter="scale",
-        )
+        large = f"would be {metres * size[0]:.4g} x {metres * size[1]:.4g} m large"
+        since = drawing.stated if scale is None else f"scale is {scale:g}"
+        raise InputError(f"{path}: {large}, since {since}; {way}", parameter="scale")
     plan = Plan(notes=list(drawing.notes))
     told = drawing.stated if scale is None else "as told"
     plan.notes.insert(0, f"one unit is {metres:.6g} m ({told}); ({low[0]:.10g}, {low[1]:.10g}) is the origin")

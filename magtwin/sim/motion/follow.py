@@ -73,11 +73,8 @@ def loop_along(
             parameter="duration_s",
         )
     if line.length > LONGEST_M:
-        raise InputError(
-            f"path {path.name}: {line.length:.4g} m are too long, at most {LONGEST_M:g} m are planned; take "
-            "a part of it",
-            parameter="path",
-        )
+        text = f"{line.length:.4g} m are too long, at most {LONGEST_M:g} m are planned; take a part of it"
+        raise InputError(f"path {path.name}: {text}", parameter="path")
     guide = guide_along(controller, line, drive, speed=speed, dt=dt)
     assert guide.pose0 is not None
     least_s = line.length / speed if duration_s is None else duration_s
@@ -182,7 +179,5 @@ def loop_by_commands(
 
 def _check_duration(duration_s: float) -> None:
     if not 0 < duration_s <= LONGEST_S:
-        raise InputError(
-            f"duration_s must be above 0 s and finite, at most {LONGEST_S:g}, a day; got {duration_s!r}",
-            parameter="duration_s",
-        )
+        text = f"duration_s must be above 0 s and finite, at most {LONGEST_S:g}, a day; got {duration_s!r}"
+        raise InputError(text, parameter="duration_s")

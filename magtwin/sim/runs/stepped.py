@@ -98,9 +98,8 @@ class SteppedRobots:
         self._exact = ExactField(scene=scene, anomaly_map=anomaly_map, outside="clamp")
         self._model_error = model_error
         if scene.robot.plant != PlantSpec():
-            raise InputError(
-                f"robot {scene.robot.name!r} has a plant, which only runs simulate; leave it out"
-            )
+            text = "has a plant, which only runs simulate; leave it out"
+            raise InputError(f"robot {scene.robot.name!r} {text}")
         self._code: ModuleType | None = None  # where numba does not work; the bytes are the same
         with suppress(ImportError):
             self._code = LOOPS.open()

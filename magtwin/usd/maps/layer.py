@@ -118,10 +118,8 @@ def layer_of_map(path: str | os.PathLike[str]) -> Path | None:
 def check_map_layer(path: str | os.PathLike[str]) -> None:
     """Refuse a file that is no map layer, as `map_layer`; errors as for `is_map_layer`."""
     if not is_map_layer(path):
-        raise InputError(
-            f"{path}: is no map layer; give the layer of a map, such as `magtwin map import` writes",
-            parameter="map_layer",
-        )
+        text = "is no map layer; give the layer of a map, such as `magtwin map import` writes"
+        raise InputError(f"{path}: {text}", parameter="map_layer")
 
 
 def _arrays(prim: Usd.Prim) -> tuple[NDArray, NDArray, NDArray, dict[str, NDArray] | None, NDArray]:
