@@ -118,10 +118,8 @@ class FurnitureTable(Spec):
                 faces = faces[:, ::-1]  # outwards
             largest = float(np.ptp(points, axis=0).max())
             if largest > LARGEST_M:
-                raise InputError(
-                    f"scale is missing: {self.file.name} would be {largest:,.0f} m large; if it is in mm, "
-                    "give scale = 0.001"
-                )
+                text = f"{self.file.name} would be {largest:,.0f} m large; if it is in mm, give scale = 0.001"
+                raise InputError(f"scale is missing: {text}")
             given["vertices_m"] = tuple(map(tuple, points.tolist()))
             given["faces"] = tuple(map(tuple, faces.tolist()))
         return FurnitureSpec(**given)

@@ -50,7 +50,7 @@ class Report(Summarized):
                 figures[key(f"{f.name.removesuffix('_nt')} sd", f.unit)] = f.spread
             notes |= {name: f.note} if f.note else {}
         facts = {key(name): value for name, value in self.metadata.items()}
-        content = {"title": self.title} | ({"verdict": self.verdict} if self.verdict else {})
+        content: dict[str, Any] = {"title": self.title} | ({"verdict": self.verdict} if self.verdict else {})
         content |= {"figures": figures, "notes": notes, "metadata": facts}
         return json.dumps(jsonable(content), indent=2)
 

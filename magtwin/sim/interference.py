@@ -128,10 +128,8 @@ def _known(scene: Scene) -> tuple[Array, Bodies]:
 def _known_earth(scene: Scene) -> EarthFieldSpec:
     """The Earth's field; refuse a scene without it."""
     if scene.earth is None:
-        raise InputError(
-            f"scene {scene.name!r} has no Earth's field, so its exact field is not known; "
-            "give it an [earth] table, or read the field from its map"
-        )
+        way = "give it an [earth] table, or read the field from its map"
+        raise InputError(f"scene {scene.name!r} has no Earth's field, so its exact field is not known; {way}")
     return scene.earth
 
 

@@ -181,8 +181,8 @@ def draw_session_plant(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
     }
     if plant.moving_moment != ZERO3:
         scaled["pan_phase"] = float(phase)
-    scaled |= {"start_field_nt": _numbers(start), "warm_up_age_s": float(age)}
-    plant = replace(plant, **scaled, **dict.fromkeys(SPREADS, 0.0))
+    scaled |= {"start_field_nt": _numbers(start), "warm_up_age_s": float(age), **dict.fromkeys(SPREADS, 0.0)}
+    plant = replace(plant, **scaled)
     left, right, lidar, battery = turns
     turned: dict[str, Any] = {
         name: _numbers(matrix @ getattr(platform, name))

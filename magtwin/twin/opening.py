@@ -407,10 +407,9 @@ def twin_of(
     )
     for name, what in _CHECKSUMS.items() if check else ():
         if metadata.get(name, "") != twin.metadata.get(name, ""):
-            raise InputError(
-                f"{scene}: {what} changed since the run: {name} is {twin.metadata.get(name, 'none')}, "
-                f"the run has {metadata.get(name, 'none')}"
-            )
+            now, then = twin.metadata.get(name, "none"), metadata.get(name, "none")
+            text = f"{what} changed since the run: {name} is {now}, the run has {then}"
+            raise InputError(f"{scene}: {text}")
     return twin
 
 

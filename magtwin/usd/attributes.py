@@ -150,9 +150,8 @@ def check_prim_name(name: str, what: str) -> str:
         InputError: It has characters other than letters, digits and _, or starts with a digit.
     """
     if not Sdf.Path.IsValidIdentifier(name):
-        raise InputError(
-            f"{what} {name!r} cannot name a prim; use letters, digits and _, not starting with a digit"
-        )
+        way = "use letters, digits and _, not starting with a digit"
+        raise InputError(f"{what} {name!r} cannot name a prim; {way}")
     return name
 
 
@@ -186,10 +185,8 @@ def _value(attribute: Usd.Attribute) -> Any:
     """As `plain_value`, of a stage that is being written."""
     value, kind = value_of(attribute), type_of(attribute)
     if not isinstance(value, kind.type.pythonClass or type(kind.defaultValue)):
-        raise InputError(
-            f"{place(attribute.GetPrim())}: {attribute.GetName()} must be a {kind}, "
-            f"got a {type(value).__name__}"
-        )
+        text = f"{attribute.GetName()} must be a {kind}, got a {type(value).__name__}"
+        raise InputError(f"{place(attribute.GetPrim())}: {text}")
     if isinstance(value, Sdf.AssetPath):  # the file need not exist
         if not value.path:
             return None

@@ -84,10 +84,8 @@ def open_stage(path: str | os.PathLike[str], *, own: bool = False) -> Usd.Stage:
     with translated(path, "cannot be opened as USD"):
         stage = Usd.Stage.Open(str(path))
         if unsaved := [x.identifier for x in stage.GetUsedLayers() if x.realPath and x.dirty]:
-            raise InputError(
-                f"{path}: {unsaved[0]} has changes in this process that are not saved; save them "
-                "(`stage.Save()`), or drop them (`layer.Reload()`)"
-            )
+            way = "save them (`stage.Save()`), or drop them (`layer.Reload()`)"
+            raise InputError(f"{path}: {unsaved[0]} has changes in this process that are not saved; {way}")
         stage.Reload()  # a layer that is still held elsewhere would be stale
         errors = stage.GetCompositionErrors()
     if errors:

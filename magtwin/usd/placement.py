@@ -118,10 +118,8 @@ def pose_of(lab: Lab) -> Pose:
     stage = lab.root.GetStage()
     metres = UsdGeom.GetStageMetersPerUnit(stage)
     if not 0 < metres < math.inf:
-        raise InputError(
-            f"{stage.GetRootLayer().identifier}: its metersPerUnit is {metres:g}; set it to 1, and make the "
-            "stage in metres"
-        )
+        text = f"its metersPerUnit is {metres:g}; set it to 1, and make the stage in metres"
+        raise InputError(f"{stage.GetRootLayer().identifier}: {text}")
     level = _level(stage)
     world = _world(lab.root)
     rows = np.array(world)[:3, :3] * metres
@@ -307,6 +305,5 @@ def _refused(lab: Lab, metres: float) -> InputError:
                 f"{place(prim)}: is {what}, and its lab with it; a lab can be moved and turned about the "
                 "vertical, but neither tilted nor scaled"
             )
-    return InputError(
-        f"{place(lab.root)}: is tilted or scaled; a lab can be moved and turned about the vertical"
-    )
+    text = "is tilted or scaled; a lab can be moved and turned about the vertical"
+    return InputError(f"{place(lab.root)}: {text}")

@@ -71,19 +71,17 @@ class Driver:
     ) -> None:
         """Measure the room."""
         if not 0 < speed <= drive.v_max:
-            raise InputError(
-                f"speed must be above 0 and at most {drive.v_max:g} m/s, the drive's v_max; got {speed!r}"
-            )
+            most = f"at most {drive.v_max:g} m/s, the drive's v_max"
+            raise InputError(f"speed must be above 0 and {most}; got {speed!r}")
         self._drive, self._rng, self._speed, self._duration_s = drive, rng, speed, duration_s
         self._keep = footprint_radius_m + MARGIN_M
         x0, x1, y0, y1 = lab.extent_m
         self._low = x0, y0
         self._clear = _clearances(lab, obstacles)
         if self._clearance(start[0], start[1]) < self._keep:
-            raise InputError(
-                f"a driver has no room at ({start[0]:.3f}, {start[1]:.3f}) m: less than {self._keep:.3f} m "
-                "from a wall or an obstacle; begin elsewhere"
-            )
+            near = f"less than {self._keep:.3f} m from a wall or an obstacle"
+            at = f"({start[0]:.3f}, {start[1]:.3f}) m"
+            raise InputError(f"a driver has no room at {at}: {near}; begin elsewhere")
         across = [np.arange(low + PLACE_M / 2, high, PLACE_M) for low, high in ((x0, x1), (y0, y1))]
         grid = np.array([(x, y) for x in across[0] for y in across[1]])
         free = [self._clearance(x, y) > self._keep + 0.05 for x, y in grid.tolist()]

@@ -32,8 +32,8 @@ BLOCK = 16
 """Runs made at a time: 130,000 readings of a minute each, 0.1 GB, and work for every thread."""
 
 
-UNPLANNED: dict[str, Any] = {"wheel_errors": (0.0, 0.0), "odometry_scale": (1.0, 1.0)}
-"""Figures of a drive on which no plan depends, beside `DRAWN`."""
+UNPLANNED: Any = {"wheel_errors": (0.0, 0.0), "odometry_scale": (1.0, 1.0), **dict.fromkeys(DRAWN, 0.0)}
+"""Figures of a drive on which no plan depends."""
 
 PLANNED = 1 << 27
 """Bytes of plans that are kept, beside the last: 1,000 of a minute each, or none of a day."""
@@ -237,7 +237,7 @@ class Runs(Summarized, Sequence[Run]):
         if isinstance(job.path, Run):
             return course_of(job.scene, job.path, job.speed, job.conditions)
         robot = job.scene.robot
-        alike = replace(robot.drive, **UNPLANNED, **dict.fromkeys(DRAWN, 0.0)), robot.footprint_radius_m
+        alike = replace(robot.drive, **UNPLANNED), robot.footprint_radius_m
         key = (job.path, job.speed, alike, job.scene.start, job.conditions)
         if key in self._planned:
             return self._planned[key]

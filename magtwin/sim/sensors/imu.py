@@ -1,5 +1,7 @@
 """IMU: orientation, rates and acceleration of a robot that rocks a little on its floor."""
 
+from typing import Any
+
 import numpy as np
 
 from magtwin.frames import canonical, quat_from_rpy, quat_multiply
@@ -38,7 +40,7 @@ class Imu(SampledSensor):
     ) -> None:
         """Switch the sensor on."""
         delays, noise = rng.spawn(2)
-        start = {"tilt": noise.standard_normal(2), "bias": spec.gyro_bias, "yaw_zero": spec.yaw_zero}
+        start: Any = {"tilt": noise.standard_normal(2), "bias": spec.gyro_bias, "yaw_zero": spec.yaw_zero}
         super().__init__(noise, walk=np.zeros(3), drift=0.0, **start)
         self._spec, self._q_base_imu = spec, q_base_imu_xyzw
         self._rate = spec.rate_hz if rate_hz is None else rate_hz

@@ -84,10 +84,8 @@ def read_magnets(stage: Usd.Stage) -> tuple[tuple[SourceSpec, ...], tuple[Furnit
     root_path = labs.pop() if len(labs) == 1 else WORLD
     for prim in prims:
         if robot := next((r for r in robots if prim.GetPath().HasPrefix(r)), None):
-            raise InputError(
-                f"{place(prim)}: a magnetic source on the robot {robot}, which moves; author it as the "
-                "robot's platform field"
-            )
+            text = f"a magnetic source on the robot {robot}, which moves"
+            raise InputError(f"{place(prim)}: {text}; author it as the robot's platform field")
         if prim.GetPath() not in taken:
             sources.append(read_source(prim, name=_name(prim, root_path, names)))
             names.add(sources[-1].name)

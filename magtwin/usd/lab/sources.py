@@ -254,9 +254,8 @@ def read_transform(prim: Usd.Prim, *, local: bool = False) -> Transform:
     rows = np.array(matrix)[:3, :3]
     lengths = np.sqrt(np.square(rows).sum(axis=1))
     if not (np.isfinite(np.array(matrix)).all() and lengths.min() > 0):
-        raise InputError(
-            f"{place(prim)}: its transform flattens it or is not finite; a source needs its size"
-        )
+        text = "its transform flattens it or is not finite; a source needs its size"
+        raise InputError(f"{place(prim)}: {text}")
     rows = rows / lengths[:, None]
     if np.abs(rows @ rows.T - np.eye(3)).max() > SQUARE:
         raise InputError(
@@ -264,10 +263,8 @@ def read_transform(prim: Usd.Prim, *, local: bool = False) -> Transform:
             "the transform into a mesh"
         )
     if np.linalg.det(rows) < 0:
-        raise InputError(
-            f"{place(prim)}: it is mirrored by a negative scale, so its magnetization is ambiguous; turn it "
-            "instead"
-        )
+        text = "it is mirrored by a negative scale, so its magnetization is ambiguous; turn it instead"
+        raise InputError(f"{place(prim)}: {text}")
     turned = Gf.Matrix4d(1)
     turned.SetRotateOnly(Gf.Matrix3d(*rows.ravel().tolist()))
     x, y, z = matrix.ExtractTranslation()

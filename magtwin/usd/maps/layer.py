@@ -73,10 +73,8 @@ def _refuse_tables(path: str | os.PathLike[str]) -> None:
     """Refuse a table of readings or a recording in place of a map."""
     if Path(path).suffix.lower() in (".csv", ".txt", ".parquet", ".pq", ".mcap", ".db3"):
         fitted = Path(path).with_suffix(".usdc").name
-        raise InputError(
-            f"{path}: a table of readings or a recording, not a map; fit a map to it first: "
-            f"magtwin map fit {quote(str(path))} --out {fitted}"
-        )
+        way = f"fit a map to it first: magtwin map fit {quote(str(path))} --out {fitted}"
+        raise InputError(f"{path}: a table of readings or a recording, not a map; {way}")
 
 
 @translates
@@ -152,9 +150,8 @@ def read_map(prim: Usd.Prim) -> AnomalyMap:
         )
     shape = tuple(get(prim, "shape"))
     if len(shape) != 3 or min(shape) < 1 or not values.size == valid.size == math.prod(shape):
-        raise InputError(
-            f"{place(prim)}: shape {list(shape)} does not fit {values.size} values and {valid.size} flags"
-        )
+        sizes = f"{values.size} values and {valid.size} flags"
+        raise InputError(f"{place(prim)}: shape {list(shape)} does not fit {sizes}")
     if variance.size not in (0, values.size, 3 * values.size):
         raise InputError(f"{place(prim)}: {values.size} values have {variance.size} variances")
     headings = np.array(get(prim, "headings"), float)
@@ -164,17 +161,13 @@ def read_map(prim: Usd.Prim) -> AnomalyMap:
             f"{str(headings.tolist())[:MOST_CHARACTERS]}; make the map anew"
         )
     if checksum != _checksum(values, valid, variance, harmonic, grid):
-        raise InputError(
-            f"{place(prim)}: the map's values do not match its checksum, which covers its grid too; make the "
-            "map anew"
-        )
+        text = "the map's values do not match its checksum, which covers its grid too; make the map anew"
+        raise InputError(f"{place(prim)}: {text}")
     spreads = variance.reshape(-1, *shape).astype(float)  # of the nodes, and between them
     recorded = _read_recorded(prim, RECORDED[0], shape)
     if recorded is not None and not np.array_equal(recorded.ravel().astype("f4"), values, equal_nan=True):
-        raise InputError(
-            f"{place(prim)}: the map's values are not those that were recorded, in single precision; make "
-            "the map anew"
-        )
+        text = "the map's values are not those that were recorded, in single precision; make the map anew"
+        raise InputError(f"{place(prim)}: {text}")
     with about(f"{place(prim)}:"):
         return AnomalyMap(
             values_nt=values.reshape(shape).astype(float) if recorded is None else recorded,
