@@ -141,10 +141,8 @@ class Sensing:
         added = bool(self._near or terms or self._plant)
         if (terms or self._plant) and self._exact.of == "none":
             what = "interference" if terms else "the robot's plant"
-            raise InputError(
-                f"scene {scene.name!r} has a constant map and no Earth field, so {what} has nothing to add "
-                "to; give the scene an Earth field"
-            )
+            text = f"has a constant map and no Earth field, so {what} has nothing to add to"
+            raise InputError(f"scene {scene.name!r} {text}; give the scene an Earth field")
         self._unmodelled = network and added
         self._reads = bool(self.wanted & _READ)
         self._reads_axes = network and "b_vector_measured_nt" in needed

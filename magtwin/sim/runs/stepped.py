@@ -172,10 +172,8 @@ class SteppedRobots:
         """
         twists = np.asarray(commands, float)
         if twists.shape != (self.count, 2) or not np.isfinite(twists).all():
-            raise InputError(
-                f"commands must be finite v [m/s], w [rad/s] of shape {(self.count, 2)}, got shape "
-                f"{twists.shape}, {np.count_nonzero(~np.isfinite(twists))} of them not finite"
-            )
+            got = f"got shape {twists.shape}, {np.count_nonzero(~np.isfinite(twists))} of them not finite"
+            raise InputError(f"commands must be finite v [m/s], w [rad/s] of shape {(self.count, 2)}, {got}")
         rows = np.arange(self.count) if which is None else np.asarray(which, np.int64)
         if not len(rows):
             return
