@@ -448,7 +448,7 @@ BROKEN = [
     (
         "translate = (1,",
         "translate = (inf,",
-        r"</World/bot>: start of placed robot must be finite, got \(inf",
+        r"</World/bot>: start of placed robot must be finite, got \(",
     ),
 ]
 
