@@ -86,7 +86,7 @@ lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies, size, lo
 
 typed: $(VENV)/.dev build/pyright/.installed  ## Check the types of docs/python.md as editors do, with pyright
 	$(BIN)/python docs/python.py build/pyright/page.py
-	build/pyright/bin/pyright --project . build/pyright/page.py
+	build/pyright/bin/pyright --project .
 
 physics: $(VENV)/.physics  ## Drive converted robots in Newton (extra physics, 600 MB)
 	$(BIN)/python -m pytest -m physics tests/sim/engines/test_newton.py tests/sim/engines/test_engine.py tests/export/test_engine_scripts.py tests/export/test_validate.py
