@@ -23,7 +23,7 @@ MOST_MB := 2350
 # Two processes whose linear algebra has threads of its own wait for each other more than they work.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 
-.PHONY: startup fuzz faults demo test test-slow readme simready blender ros released physics physx lint paper bench zoo locks locks-test wheel-test schema assets pictures clean help
+.PHONY: startup fuzz faults demo test test-slow readme simready blender ros released physics physx lint typed paper bench zoo locks locks-test wheel-test schema assets pictures clean help
 
 help:  ## Say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -62,6 +62,12 @@ build/simready/.installed:
 	$(call install,build/simready) 'simready-validate>=2026.8' 'simready-foundation-tier-core>=2026.8' 'simready-foundation-tier-sensors>=2026.8'
 	@touch $@
 
+build/pyright/.installed:
+	$(call venv,build/pyright)
+	$(call install,build/pyright) 'pyright>=1.1.400'
+	$(call install,build/pyright) --target build/pyright/stubs types-usd
+	@touch $@
+
 build/ros-%/.installed:
 	$(call venv,build/ros-$*)
 	$(call install,build/ros-$*) numpy 'ros-$*-rclpy[fastrtps]' ros-$*-sensor-msgs ros-$*-geometry-msgs ros-$*-nav-msgs ros-$*-rosgraph-msgs ros-$*-diagnostic-msgs ros-$*-std-srvs
@@ -77,6 +83,10 @@ lint: $(VENV)/.dev  ## Format, lint, types, import rules, dependencies, size, lo
 	$(BIN)/python .ci/house.py
 	$(BIN)/python .ci/locks.py --check
 	$(BIN)/python .ci/walks.py
+
+typed: $(VENV)/.dev build/pyright/.installed  ## Check the types of docs/python.md as editors do, with pyright
+	$(BIN)/python docs/python.py build/pyright/page.py
+	build/pyright/bin/pyright --project .
 
 physics: $(VENV)/.physics  ## Drive converted robots in Newton (extra physics, 600 MB)
 	$(BIN)/python -m pytest -m physics tests/sim/engines/test_newton.py tests/sim/engines/test_engine.py tests/export/test_engine_scripts.py tests/export/test_validate.py

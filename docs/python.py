@@ -1,4 +1,7 @@
-"""Run the blocks of python.md and draw its pictures: `python docs/python.py`."""
+"""Run the blocks of python.md and draw its pictures: `python docs/python.py`.
+
+With the name of a file, the blocks are written there and not run: for `make typed`.
+"""
 
 import os
 import re
@@ -48,6 +51,10 @@ def draw(namespace: dict[str, Any], name: str, out: Path) -> None:
 def main() -> None:
     """Run every block in a temporary folder, and draw the pictures."""
     page = (HERE / "python.md").read_text(encoding="utf-8")
+    if sys.argv[1:]:
+        code = "\n\n".join(text for kind, text in steps(page) if kind == "code")
+        Path(sys.argv[1]).write_text(code, encoding="utf-8")
+        return
     (HERE / "python").mkdir(exist_ok=True)
     namespace: dict[str, Any] = {"__name__": "__main__"}
     with tempfile.TemporaryDirectory() as folder:

@@ -4,7 +4,8 @@ import ast
 import difflib
 import re
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -76,6 +77,15 @@ class InputError(ValueError):
         return f"{named}: {text}" if named and named not in text else text
 
 
+@contextmanager
+def about(start: str) -> Iterator[None]:
+    """Errors inside begin with what they are about."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{start} {error}") from error
+
+
 def is_termination(error: BaseException) -> bool:
     """Whether an error ends the command itself, and is not a `sys.exit` of code that the user gave."""
     return isinstance(error, SystemExit) and error.code == TERMINATED
@@ -108,8 +118,7 @@ def hint(name: object, known: Iterable[str]) -> str:
 
 def near(name: object, known: Iterable[str]) -> str:
     """An addition to a text with the nearest known name: " (did you mean 'left'?)", or ""."""
-    match = _nearest(name, sorted(known))
-    return f" (did you mean {match!r}?)" if match else ""
+    return f" (did you mean {match!r}?)" if (match := _nearest(name, sorted(known))) else ""
 
 
 def _nearest(name: object, known: list[str]) -> str:

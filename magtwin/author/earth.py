@@ -31,11 +31,9 @@ def earth_of(text: str) -> tuple[float, float, float]:
             return earth_field_nt(x, y, z, words[3])
         size = sum(c * c for c in checked_earth_nt((x, y, z))) ** 0.5
         if not LEAST_USUAL_NT <= size <= MOST_USUAL_NT:
-            raise InputError(
-                f"`earth={text}` is a field of {size:.6g} nT, and the Earth's is some 22,000 to 67,000; give "
-                "it in nT, or as latitude,longitude,height,date",
-                parameter="earth",
-            )
+            way = "give it in nT, or as latitude,longitude,height,date"
+            what = f"a field of {size:.6g} nT, and the Earth's is some 22,000 to 67,000"
+            raise InputError(f"`earth={text}` is {what}; {way}", parameter="earth")
         return x, y, z
     from magtwin.usd.scene import read_scene
 

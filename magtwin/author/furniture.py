@@ -118,10 +118,8 @@ class FurnitureTable(Spec):
                 faces = faces[:, ::-1]  # outwards
             largest = float(np.ptp(points, axis=0).max())
             if largest > LARGEST_M:
-                raise InputError(
-                    f"scale is missing: {self.file.name} would be {largest:,.0f} m large; if it is in mm, "
-                    "give scale = 0.001"
-                )
+                text = f"{self.file.name} would be {largest:,.0f} m large; if it is in mm, give scale = 0.001"
+                raise InputError(f"scale is missing: {text}")
             given["vertices_m"] = tuple(map(tuple, points.tolist()))
             given["faces"] = tuple(map(tuple, faces.tolist()))
         return FurnitureSpec(**given)
@@ -188,11 +186,10 @@ def check_stands(piece: FurnitureSpec, lab: LabSpec) -> None:
     beyond = -float(lab.inside_m(world[:, :2]).min()) - edge
     if beyond > 1e-6:
         size, hint = np.ptp(world, axis=0), ""
-        floor = "floor" if lab.floor else "floor_m"
         x, y = (side + 2 * edge for side in lab.floor_m)
-        slab = f"{x:g} x {y:g} m about the origin"
+        floor, slab = "floor_m", f"{x:g} x {y:g} m about the origin"
         if lab.floor:
-            slab = f"the floor of {lab.size_text}, and {edge:g} m around it"
+            floor, slab = "floor", f"the floor of {lab.size_text}, and {edge:g} m around it"
         if any(part.faces for part in piece.parts) and size.max() > HUGE_M:
             hint = f"; it is {size[0]:.3g} x {size[1]:.3g} m: is its file in mm? then scale = 0.001"
         raise InputError(

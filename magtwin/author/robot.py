@@ -14,7 +14,7 @@ from magtwin.files.file import existing_file
 from magtwin.files.kinds import expected
 from magtwin.files.settings import from_table, read_toml
 from magtwin.sim.plant_families import draw_plant
-from magtwin.spec.base import Spec
+from magtwin.spec.base import ZERO3, Spec
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.magnetics import PlatformFieldSpec
 from magtwin.spec.plant import PlantSpec
@@ -29,15 +29,14 @@ from magtwin.usd.robot import load_robot as load_robot
 from magtwin.usd.robot import urdf_of
 from magtwin.usd.schema import NOUNS, prims_with
 from magtwin.usd.sensors import (
+    ON_ROOT,
     define_battery,
     define_drive,
     define_footprint,
     define_imu,
     define_lidar,
     define_magnetometer,
-    define_mocap,
-    define_plant,
-    define_platform,
+    define_on_root,
     read_drive,
 )
 
@@ -163,6 +162,22 @@ def read_settings(settings: str | os.PathLike[str]) -> RobotSettings:
     return from_table(RobotSettings, read_toml(expected(settings, "settings of a robot")), settings)
 
 
+def mounted(text: str) -> MagnetometerSpec:
+    """A magnetometer from "LINK" or "LINK:x,y,z", its link and its place on it [m].
+
+    Raises:
+        InputError: It is neither.
+    """
+    link, _, place = text.partition(":")
+    try:
+        p = tuple(float(part) for part in place.split(",")) if place else ZERO3
+    except ValueError:
+        p = ()
+    if not link or len(p) != 3:
+        raise InputError(f"magnetometer must be LINK or LINK:X,Y,Z, got {text!r}", parameter="magnetometer")
+    return MagnetometerSpec(link=link, p_link_sensor=p)
+
+
 def read_description(asset: str | os.PathLike[str]) -> str:
     """Text of the URDF that an asset was converted from, with base_link as its root; "" if it is missing.
 
@@ -193,9 +208,8 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
         define_drive(robot, drive)
         notes += found
     notes += stand_on_floor(robot, read_drive(robot))
-    define_platform(robot, settings.platform)
-    define_mocap(robot, settings.mocap)
-    define_plant(robot, settings.plant.spec)
+    for noun in ON_ROOT:
+        define_on_root(robot, noun, settings.plant.spec if noun == "plant" else getattr(settings, noun))
     define_battery(stage, _free(links, _base(robot), "battery"), settings.battery)
     sensors: tuple[tuple[str, Any, Any, Any], ...] = (
         ("imu", settings.imu, ImuSpec(), define_imu),

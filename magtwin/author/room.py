@@ -47,9 +47,7 @@ def check_start(placed: PlacedRobot, lab: LabSpec, obstacles: Obstacles) -> None
             f"start's yaw must be in radians, at most 2 pi; {yaw:g} deg are {math.radians(yaw):.4f} rad"
         )
     inside = [k for k, name in enumerate(obstacles.names) if lab.built or name.startswith(str(FURNITURE))]
-    standing = Obstacles(
-        tuple(obstacles.names[k] for k in inside), tuple(obstacles.outlines[k] for k in inside)
-    )
+    standing = obstacles.only(inside)
     distance, which = standing.clearance([[x, y]], reach_m=radius)
     corners = np.array(lab.corners)
     half, middle = np.ptp(corners, axis=0) / 2, (corners.max(axis=0) + corners.min(axis=0)) / 2
@@ -60,33 +58,18 @@ def check_start(placed: PlacedRobot, lab: LabSpec, obstacles: Obstacles) -> None
         what = f"off the floor of {2 * half[0]:g} x {2 * half[1]:g} m"
     else:
         return
-    free = _nearest_free(x, y, middle, half - radius, standing, lab, radius)
-    hint = f"start = [{free[0]:.2f}, {free[1]:.2f}, 0.0] is free" if free else "there is no free place"
+    reach, free = half - radius, np.empty((0, 2))
+    if min(reach) > 0:  # on a raster of about 5 cm
+        steps = [min(400, max(3, int(r / 0.025))) for r in reach]
+        axes = [m + np.linspace(-r, r, n) for m, r, n in zip(middle, reach, steps, strict=True)]
+        at = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+        distance, _ = standing.clearance(at, reach_m=radius + 0.05)
+        free = at[(distance >= radius + 0.05) & on_polygon(at, lab.corners)]
+    hint = "there is no free place"
+    if len(free):
+        nearest = free[np.argmin(np.hypot(free[:, 0] - x, free[:, 1] - y))]
+        hint = f"start = [{nearest[0]:.2f}, {nearest[1]:.2f}, 0.0] is free"
     raise InputError(f"start ({x:g}, {y:g}) of robot {placed.robot.name!r} is {what}; {hint}")
-
-
-def _nearest_free(
-    x: float,
-    y: float,
-    middle: np.ndarray,
-    reach: np.ndarray,
-    standing: Obstacles,
-    lab: LabSpec,
-    radius: float,
-) -> tuple[float, float] | None:
-    """The free place nearest to a point, on a raster of about 5 cm."""
-    if min(reach) <= 0:
-        return None
-    axes = [
-        m + np.linspace(-r, r, min(400, max(3, int(r / 0.025)))) for m, r in zip(middle, reach, strict=True)
-    ]
-    at = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    distance, _ = standing.clearance(at, reach_m=radius + 0.05)
-    free = at[(distance >= radius + 0.05) & on_polygon(at, lab.corners)]
-    if not len(free):
-        return None
-    nearest = free[np.argmin(np.hypot(free[:, 0] - x, free[:, 1] - y))]
-    return float(nearest[0]), float(nearest[1])
 
 
 def lab_of(

@@ -9,14 +9,13 @@ import importlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from magtwin.author.furniture import FurnitureTable, check_stands
-from magtwin.author.robot import RobotSettings
+from magtwin.author.robot import RobotSettings, mounted
 from magtwin.author.room import asset_named, check_name, lab_of
-from magtwin.author.scene import check_names, check_things
+from magtwin.author.scene import check_things
 from magtwin.author.scene_file import EarthTable
 from magtwin.author.tables import table_of, table_of_robot, toml_text
 from magtwin.author.walls import DoorTable, WallTable, lab_with_walls
@@ -321,7 +320,7 @@ class Room(Summarized):
         """
         values = {"name": self._free("wall", "wall", first=0), **more, "from": start, "to": end}
         from_values(WallTable, values, f"wall {values['name']!r}")
-        return self._adding("wall", values)._standing()
+        return self._adding("wall", values)
 
     def door(self, at_m: float, wall: str | None = None, **more: Unpack[DoorKeys]) -> "Room":
         """Add a door that is open, or opens, to a wall.
@@ -418,14 +417,8 @@ class Room(Summarized):
             asset_named(Path(robot), str(robot), "robot")
             values = {"asset": str(robot) if bare else existing(robot, "robot asset")}
         if isinstance(magnetometer, str):
-            link, _, place = magnetometer.partition(":")
-            try:
-                at_link = [float(part) for part in place.split(",")] if place else [0.0, 0.0, 0.0]
-            except ValueError:
-                at_link = []
-            if not link or len(at_link) != 3:
-                raise InputError(f"magnetometer must be LINK or LINK:X,Y,Z, got {magnetometer!r}")
-            magnetometer = {"link": link, "p_link_sensor": at_link}
+            mount = mounted(magnetometer)
+            magnetometer = {"link": mount.link, "p_link_sensor": mount.p_link_sensor}
         given = {"magnetometer": magnetometer, **parts}
         values |= {k: table_of(v) if is_dataclass(v) else v for k, v in given.items() if v is not None}
         known = {f.name for f in fields(RobotSettings)} | {"asset", "urdf"}
@@ -439,10 +432,12 @@ class Room(Summarized):
         values |= {"network": None if network is None else existing(network, "weights file")}
         return self._adding("robot", values)
 
-    @cached_property
+    @property  # not a cached one, which pyright does not take for `magtwin.twin.twin.HasScene`
     def scene(self) -> Scene:
         """The scene, surveyed by its robot unless the room has a map. It is made once."""
-        return importlib.import_module("magtwin").scene_from_toml(self)  # type: ignore[no-any-return]
+        if "_scene" not in self.__dict__:
+            self.__dict__["_scene"] = importlib.import_module("magtwin").scene_from_toml(self)
+        return self.__dict__["_scene"]  # type: ignore[no-any-return]
 
     def with_(self, changes: Mapping[str, Any] | None = None, **values: Any) -> Scene:
         """The room's scene with something changed, and the map as it was; see `Scene.with_`."""
@@ -463,8 +458,8 @@ class Room(Summarized):
         robots = self.table.get("robot", ())
         if not robots:
             raise InputError(f'room {self.table["name"]!r} has no robot; add one: .robot("turtlebot4")')
-        alone = len(robots) == 1 and robots[0]["name"] == Path(robots[0].get("asset", "")).stem
-        alone = alone or (len(robots) == 1 and "urdf" in robots[0])
+        first, alone = robots[0], len(robots) == 1
+        alone = alone and ("urdf" in first or first["name"] == Path(first.get("asset", "")).stem)
         single = {key: value for key, value in robots[0].items() if key != "name"}
         order = sorted(self.table, key=lambda key: isinstance(self.table[key], dict | list))
         tables = {key: self.table[key] for key in order}
@@ -479,7 +474,7 @@ class Room(Summarized):
         earth = table["earth"]
         rows = [
             ("furniture", listed([piece["name"] for piece in table.get("furniture", ())], 80)),
-            ("walls", listed([f"{wall['name']}" for wall in table.get("wall", ())], 80)),
+            ("walls", listed([wall["name"] for wall in table.get("wall", ())], 80)),
             ("robots", listed([robot["name"] for robot in table.get("robot", ())], 80) or "none yet"),
             ("earth", f"{earth['latitude_deg']:g}, {earth['longitude_deg']:g} deg, {earth['date']}"),
         ]
@@ -507,11 +502,7 @@ class Room(Summarized):
             wall = walls[-1]["name"]
         values = {"name": self._free(section, section, first=0), **more, "wall": wall, "at_m": at_m}
         from_values(cls, values, f"{section} {values['name']!r}")
-        return self._adding(section, values)._standing()
-
-    def _standing(self) -> "Room":
-        self._lab()
-        return self
+        return self._adding(section, values)
 
     def _free(self, section: str, stem: str, *, first: int = 1) -> str:
         """A name that no table of the section has: box, box_2; or wall_0, wall_1."""
@@ -525,7 +516,10 @@ class Room(Summarized):
             raise InputError(
                 f"two things of [[{section}]] are called {values['name']!r}; give each its own name"
             )
-        return self._with(**{section: [*held, plain(values)]})
+        room = self._with(**{section: [*held, plain(values)]})
+        if section in ("wall", "door", "window"):
+            room._lab()  # refuses what cannot stand
+        return room
 
     def _with(self, **tables: Any) -> "Room":
         room = Room.__new__(Room)
@@ -542,7 +536,6 @@ def changed(scene: Scene, changes: Mapping[str, Any]) -> Scene:
             scene = replace(scene, map_layer=file, map_sha256=layer_sha256(file))
             continue
         scene = _set(scene, way.split("."), value, way)
-    check_names(scene.sources, scene.furniture)
     check_things(scene)
     for piece in scene.furniture:
         if piece not in before:
@@ -555,20 +548,17 @@ def _set(spec: Any, way: Sequence[str], value: Any, whole: str) -> Any:
     name, *rest = way
     if isinstance(spec, tuple):
         named = [str(getattr(each, "name", "") or each.robot.name) for each in spec]
-        if not any(fnmatch.fnmatchcase(each, name) for each in named):
-            raise InputError(
-                f"{whole}: there is no {name!r}; {hint(name, named) if named else 'there is none'}"
-            )
         chosen = [fnmatch.fnmatchcase(each, name) for each in named]
-        if not rest and value is None:
-            return tuple(each for each, out in zip(spec, chosen, strict=True) if not out)
+        if not any(chosen):
+            near = hint(name, named) if named else "there is none"
+            raise InputError(f"{whole}: there is no {name!r}; {near}")
+        if not rest and value is not None:
+            way = f"a field, as in {whole}.p_world, or be None to remove it"
+            raise InputError(f"{whole} must be followed by {way}")
+        each_chosen = zip(spec, chosen, strict=True)
         if not rest:
-            raise InputError(
-                f"{whole} must be followed by a field, as in {whole}.p_world, or be None to remove it"
-            )
-        return tuple(
-            _set(each, rest, value, whole) if this else each for each, this in zip(spec, chosen, strict=True)
-        )
+            return tuple(each for each, this in each_chosen if not this)
+        return tuple(_set(each, rest, value, whole) if this else each for each, this in each_chosen)
     if not is_dataclass(spec) or isinstance(spec, type):
         raise InputError(f"{whole}: there is nothing below {spec!r}")
     if name == "yaw" and hasattr(spec, "q_world_xyzw"):
@@ -582,9 +572,8 @@ def _set(spec: Any, way: Sequence[str], value: Any, whole: str) -> Any:
             return spec.with_part(name, new)
         return replace(spec, **{name: new})
     except InputError as error:
-        raise InputError(
-            str(error) if whole == name or whole in str(error) else f"{whole}: {error}"
-        ) from error
+        start = "" if whole == name or whole in str(error) else f"{whole}: "
+        raise InputError(f"{start}{error}") from error
 
 
 def written(tables: Mapping[str, Any], out: File | None, force: bool) -> str:

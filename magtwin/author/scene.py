@@ -17,7 +17,7 @@ from magtwin.files.outputs import output
 from magtwin.frames import quat_from_yaw
 from magtwin.spec.furniture import FurnitureSpec
 from magtwin.spec.magnetics import SourceSpec
-from magtwin.spec.robot import PlacedRobot
+from magtwin.spec.robot import PlacedRobot, fields_of
 from magtwin.spec.scene import Scene
 from magtwin.urdf.convert import THUMBNAILS
 from magtwin.usd.attributes import check_prim_name, write_pose
@@ -36,16 +36,15 @@ from magtwin.usd.schema import author, author_targets, only_prim_with
 from magtwin.usd.sensors import (
     MAP_CHECKSUM,
     MAP_RELATIONSHIP,
+    ON_ROOT,
     define_battery,
     define_drive,
     define_footprint,
     define_imu,
     define_lidar,
     define_magnetometer,
-    define_mocap,
+    define_on_root,
     define_path,
-    define_plant,
-    define_platform,
 )
 
 EARTH = WORLD.AppendChild("Earth")
@@ -176,13 +175,7 @@ def _with_copies(scene: Scene, folder: Path) -> Scene:
             path = once(path, "paths", robot.name, _copied)
         robot = replace(robot, asset=asset, magnetometer=magnetometer)
         robots.append(PlacedRobot(robot=robot, start=placed.start, path=path))
-    return replace(
-        scene,
-        map_layer=_copied(scene.map_layer, folder / "map"),
-        robot=robots[0].robot,
-        path=robots[0].path,
-        others=tuple(robots[1:]),
-    )
+    return replace(scene, map_layer=_copied(scene.map_layer, folder / "map"), **fields_of(robots))
 
 
 def _copied(file: Path, folder: Path) -> Path:
@@ -222,25 +215,15 @@ def _write_parts(scene: Scene, folder: Path) -> list[Path]:
         if scene.sources:
             define_sources(stage, scene.sources)
 
+    def furniture(stage: Usd.Stage) -> None:
+        define_furniture(stage, scene.furniture)
+
+    room = "The room, its lights and its physics, by magtwin"
+    what = "What makes the magnetic field: the Earth and magnetised things"
     parts: list[tuple[str, object, str, Callable[[Usd.Stage], object]]] = [
-        (
-            "room",
-            True,
-            "The room, its lights and its physics, by magtwin",
-            lambda s: define_lab(s, scene.lab),
-        ),
-        (
-            "furniture",
-            scene.furniture,
-            "Furniture and columns, and how they are magnetised",
-            lambda stage: define_furniture(stage, scene.furniture),
-        ),
-        (
-            "magnetics",
-            scene.earth or scene.sources,
-            "What makes the magnetic field: the Earth and magnetised things",
-            field,
-        ),
+        ("room", True, room, lambda stage: define_lab(stage, scene.lab)),
+        ("furniture", scene.furniture, "Furniture and columns, and how they are magnetised", furniture),
+        ("magnetics", scene.earth or scene.sources, what, field),
     ]
     shapes = folder / SHAPES_FILE
     with new_stage(shapes, "Unit shapes of what is shown, by magtwin") as stage:
@@ -270,9 +253,8 @@ def _define_robot(stage: Usd.Stage, placed: PlacedRobot, map_sha256: str) -> Non
     define_footprint(prim, robot.footprint_radius_m)
     define_path(prim, placed.path)
     define_drive(prim, robot.drive)
-    define_platform(prim, robot.platform)
-    define_mocap(prim, robot.mocap)
-    define_plant(prim, robot.plant)
+    for noun in ON_ROOT:
+        define_on_root(prim, noun, getattr(robot, noun))
     for part, define in PARTS.items():
         define(stage, only_prim_with(prim, part).GetPath(), getattr(robot, part))
     magnetometer = only_prim_with(prim, "magnetometer")

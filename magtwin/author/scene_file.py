@@ -14,7 +14,7 @@ from magtwin.author.robot import RobotSettings, build_robot
 from magtwin.author.room import asset_named, check_name, check_start, lab_of, obstacles_in
 from magtwin.author.scene import check_names, check_things
 from magtwin.author.walls import DoorTable, WallTable, check_not_in_walls, lab_with_walls
-from magtwin.errors import InputError
+from magtwin.errors import InputError, about
 from magtwin.files.file import existing_file, sha256
 from magtwin.files.kinds import expected
 from magtwin.files.settings import from_table, read_toml, refused_at
@@ -25,7 +25,7 @@ from magtwin.spec.furniture import FurnitureSpec
 from magtwin.spec.lab import LabSpec, SurveySpec
 from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.robot import PlacedRobot, RobotSpec
+from magtwin.spec.robot import PlacedRobot, RobotSpec, fields_of
 from magtwin.spec.scene import Scene
 from magtwin.spec.walls import Window
 from magtwin.usd.lab.earth import checked
@@ -221,14 +221,11 @@ def scene_from_toml(
         name=given.name,
         map_layer=Path("surveyed") if layer is None else layer,
         map_sha256="" if layer is None else layer_sha256(layer),
-        robot=robots[0].robot,
         lab=lab,
         earth=earth,
         sources=sources,
         furniture=pieces,
-        start=robots[0].start,
-        path=robots[0].path,
-        others=tuple(robots[1:]),
+        **fields_of(robots),
     )
     with about(f"{path}:"):
         check_things(scene)
@@ -237,15 +234,6 @@ def scene_from_toml(
             surveyed = survey_of(scene, given.survey or SurveySpec(), given.seed, standing)
         scene = replace(scene, map_layer=surveyed, map_sha256=layer_sha256(surveyed))
     return scene
-
-
-@contextmanager
-def about(start: str) -> Iterator[None]:
-    """Errors inside begin with what they are about."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{start} {error}") from error
 
 
 @contextmanager
@@ -274,24 +262,18 @@ def check_above_floor(robot: RobotSpec, where: str) -> None:
 
 def _scaled(table: Mapping[str, Any], scale: float) -> dict[str, Any]:
     """The table of a scene whose floor is `scale` times as wide, with all things in the same part of it."""
-
-    def placed(thing: Mapping[str, Any]) -> dict[str, Any]:
-        x, y, z = thing["p_world"]
-        return {**thing, "p_world": [x * scale, y * scale, z]}
-
+    factors: dict[str, Any] = {**dict.fromkeys(("from", "to", "at_m"), scale), "p_world": (scale, scale, 1.0)}
     lab = dict(table.get("lab", {}))
     if "floor_m" in lab:
         lab["floor_m"] = [round(side * scale, 3) for side in lab["floor_m"]]
     if "floor" in lab:
         lab["floor"] = [[c * scale for c in corner] for corner in lab["floor"]]
-    things = {key: [placed(thing) for thing in table[key]] for key in ("furniture", "source") if key in table}
-    for key in ("wall", "door", "window"):
-        places = ("from", "to", "at_m")
-        things[key] = [
-            {k: (np.multiply(v, scale).tolist() if k in places else v) for k, v in thing.items()}
-            for thing in table.get(key, [])
-        ]
-    return {**table, "lab": lab, **things}
+
+    def placed(thing: Mapping[str, Any]) -> dict[str, Any]:
+        return {k: np.multiply(v, factors[k]).tolist() if k in factors else v for k, v in thing.items()}
+
+    sections = [key for key in ("furniture", "source", "wall", "door", "window") if key in table]
+    return {**table, "lab": lab, **{key: [placed(thing) for thing in table[key]] for key in sections}}
 
 
 def _robot(
@@ -349,18 +331,14 @@ def _with_network(
 ) -> RobotSpec:
     """The robot with the weights and the kind of its table; `network` replaces the weights."""
     weights = Path(network).resolve() if network is not None else table.network
+    changes: dict[str, Any] = {}
     if weights is not None:
         weights = expected(weights, "weights file")
-        magnetometer = replace(
-            robot.magnetometer,
-            kind="neural",
-            network=weights,
-            network_sha256=sha256(weights),
-            inputs=inputs_of(weights),
-        )
-        robot = replace(robot, magnetometer=magnetometer)
+        changes = {"kind": "neural", "network": weights, "network_sha256": sha256(weights)}
+        changes["inputs"] = inputs_of(weights)
     if table.kind is not None and network is None:
-        robot = replace(robot, magnetometer=replace(robot.magnetometer, kind=table.kind))
+        changes["kind"] = table.kind
+    robot = replace(robot, magnetometer=replace(robot.magnetometer, **changes))
     if robot.magnetometer.kind == "neural" and robot.magnetometer.network is None:
         raise InputError(f'{where} kind = "neural" needs network = "FILE"')
     return robot

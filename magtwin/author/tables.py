@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,8 @@ def toml_text(table: Mapping[str, Any]) -> str:
     def write(table: Mapping[str, Any], section: str) -> None:
         below = []
         for key, value in table.items():
-            if isinstance(value, Mapping) or (isinstance(value, list) and value and _are_tables(value)):
+            several = isinstance(value, list) and value and all(isinstance(v, Mapping) for v in value)
+            if isinstance(value, Mapping) or several:
                 below.append((f"{section}.{_key(key)}" if section else _key(key), value))
             else:
                 lines.append(f"{_key(key)} = {_text(value)}")
@@ -37,10 +38,6 @@ def toml_text(table: Mapping[str, Any]) -> str:
 
     write(table, "")
     return "\n".join(lines).strip() + "\n"
-
-
-def _are_tables(values: Sequence[Any]) -> bool:
-    return all(isinstance(value, Mapping) for value in values)
 
 
 def _key(key: str) -> str:
@@ -70,14 +67,10 @@ def table_of_scene(scene: Scene) -> Table:
     if scene.earth is not None:
         table["earth"] = table_of(scene.earth)
     if scene.sources:
-        table["source"] = [
-            table_of(source, leave={"size_m"} if source.faces else set()) for source in scene.sources
-        ]
+        table["source"] = [table_of(s, leave={"size_m"} if s.faces else set()) for s in scene.sources]
     if scene.furniture:  # magnetization is given, or else it would be drawn
-        pieces = [(piece, table_of(piece)) for piece in scene.furniture]
-        table["furniture"] = [
-            {**given, "magnetization": list(piece.magnetization)} for piece, given in pieces
-        ]
+        drawn = [{"magnetization": list(piece.magnetization)} for piece in scene.furniture]
+        table["furniture"] = [table_of(p) | own for p, own in zip(scene.furniture, drawn, strict=True)]
     return table | {"robot": robots[0] if alone else robots}
 
 
@@ -120,11 +113,8 @@ def table_of_robot(placed: PlacedRobot) -> Table:
     """A robot as its asset, and what differs from it."""
     robot, asset = placed.robot, load_robot(placed.robot.asset)
     known = shipped("robots") / robot.asset.stem / robot.asset.name
-    table: Table = {
-        "name": robot.name,
-        "asset": robot.asset.stem if known == robot.asset else str(robot.asset),
-        "start": list(placed.start),
-    }
+    named = robot.asset.stem if known == robot.asset else str(robot.asset)
+    table: Table = {"name": robot.name, "asset": named, "start": list(placed.start)}
     if placed.path:
         table["path"] = str(placed.path)
     if robot.footprint_radius_m != asset.footprint_radius_m:

@@ -45,32 +45,6 @@ class DoorTable(Door):
     0 without steel."""
 
 
-def with_walls(
-    lab: LabSpec,
-    walls: Sequence[Wall],
-    doors: Sequence[Door],
-    windows: Sequence[Window] = (),
-    *,
-    seed: int = 0,
-) -> LabSpec:
-    """A room with walls, doors and windows; steel without a magnetization draws it from the seed.
-
-    Args:
-        lab: The room.
-        walls: Walls, or tables of walls, in order.
-        doors: Doors, or tables of doors, in order.
-        windows: Windows, in order.
-        seed: Seed of the scene.
-
-    Raises:
-        InputError: A door or window is in no wall or not within it, or a wall stands in one.
-    """
-    built = Structure.named(walls, doors, windows, lab.sides)
-    own_walls = tuple(_drawn(Wall, wall, wall.length_m, seed) for wall in built.walls)
-    own_doors = tuple(_drawn(Door, door, door.width_m, seed) for door in built.doors)
-    return replace(lab, walls=own_walls, doors=own_doors, windows=built.windows)
-
-
 def _drawn(cls: type[W], table: Any, length_m: float, seed: int) -> W:
     """The wall or door of a table."""
     values = {f.name: getattr(table, f.name) for f in fields(cls)}  # type: ignore[arg-type]
@@ -91,16 +65,28 @@ def lab_with_walls(
     *,
     seed: int,
 ) -> LabSpec:
-    """As `with_walls`, of the tables of a TOML `path`.
+    """A room with walls, doors and windows; steel without a magnetization draws it from the seed.
+
+    Args:
+        lab: The room.
+        walls: Walls, or tables of walls, in order.
+        doors: Doors, or tables of doors, in order.
+        windows: Windows, in order.
+        path: The TOML of the tables, for error messages.
+        seed: Seed of the scene.
 
     Raises:
-        InputError: As there, or a wall stands off the floor; the text has file and line.
+        InputError: A door or window is in no wall or not within it, or a wall stands in one or off the floor;
+            the text has file and line.
     """
     if not (walls or doors or windows):
         return lab
-    for section, number, key, text in Structure.named(walls, doors, windows, lab.sides).faults():
+    built = Structure.named(walls, doors, windows, lab.sides)
+    for section, number, key, text in built.faults():
         raise refused_at(path, key, text, section=section, number=number)
-    made = with_walls(lab, walls, doors, windows, seed=seed)
+    own_walls = tuple(_drawn(Wall, wall, wall.length_m, seed) for wall in built.walls)
+    own_doors = tuple(_drawn(Door, door, door.width_m, seed) for door in built.doors)
+    made = replace(lab, walls=own_walls, doors=own_doors, windows=built.windows)
     for number, wall in enumerate(made.walls):
         p_xy, beyond = off_floor_m(wall, lab)
         x, y = p_xy[beyond.argmax()]
@@ -145,9 +131,7 @@ def check_not_in_walls(
     for name, outline in placed:
         if name.startswith(f"{FURNITURE}/"):
             parts.setdefault(name.split("/")[3], []).append(outline)
-    upper = {
-        piece.name: [_outline(piece, part) for part in piece.parts if not part.faces] for piece in pieces
-    }
+    upper = {p.name: [_outline(p, part) for part in p.parts if not part.faces] for p in pieces}
     for piece, standing in parts.items():
         whole = Obstacles((piece,), (np.concatenate(standing),)).outlines  # a table's legs are beside a side
         outlines = [*standing, *upper.get(piece, ())]  # with what robots pass below, such as its top

@@ -71,9 +71,8 @@ def existing(path: str | os.PathLike[str], what: str) -> Path:
             text = f"a link to {str(path.readlink())!r}, which does not exist; restore that, or give another"
             raise InputError(f"{path}: no such {what}: {text}") from None
         near = _near_file(path)
-        raise InputError(
-            f"{path}: no such {what}" + (f"; did you mean {near!r}?" if near else made)
-        ) from None
+        hint = f"; did you mean {near!r}?" if near else made
+        raise InputError(f"{path}: no such {what}{hint}") from None
     except ValueError as error:  # a null character
         raise InputError(f"{str(path)!r}: no name of a {what}: {error}") from error
     except OSError as error:
@@ -187,17 +186,8 @@ def git_revision(folder: str | os.PathLike[str]) -> str:
     settings = [parent / ".git" / "config" for parent in (place, *place.parents)]
     if any(os.path.lexists(path) and not path.is_file() for path in settings):
         return ""
-    command = [
-        "git",
-        "-c",
-        "safe.directory=*",
-        "-C",
-        os.fspath(folder),
-        "rev-parse",
-        "--verify",
-        "-q",
-        "HEAD",
-    ]
+    command = ["git", "-c", "safe.directory=*", "-C", os.fspath(folder)]
+    command += ["rev-parse", "--verify", "-q", "HEAD"]
     try:
         done = run(command, limit_s=_GIT_S, changes={n: None for n in os.environ if n.startswith("GIT_")})
     except OSError:

@@ -226,13 +226,10 @@ def refused(path: str | os.PathLike[str], kind: Kind, noun: str) -> InputError:
 def kind_of(path: Path) -> Kind | None:
     """The kind of a file or folder; None if it is not known, or cannot be read."""
     try:
-        return _kind_of_folder(path) if path.is_dir() else _BY_SUFFIX.get(path.suffix.lower(), _unknown)(path)
+        reader = _kind_of_folder if path.is_dir() else _BY_SUFFIX.get(path.suffix.lower())
+        return reader and reader(path)
     except OSError:
         return None
-
-
-def _unknown(path: Path) -> None:
-    return None
 
 
 def _is(kind: Kind) -> Callable[[Path], Kind]:
@@ -240,23 +237,18 @@ def _is(kind: Kind) -> Callable[[Path], Kind]:
 
 
 def _kind_of_folder(folder: Path) -> Kind | None:
+    robot = (folder / "payloads").is_dir() and not (folder / "robots").is_dir()  # layers, and no map
     for name, kind in (
         ("dataset.json", DATASET),
         ("suite.json", RESULTS),
         ("metadata.yaml", RUN),
         ("run.parquet", RUN),
         ("runs.csv", SWEEP),
-        (stage_in(folder).name, _kind_of_stages(folder)),
+        (stage_in(folder).name, ROBOT_FOLDER if robot else SCENE_FOLDER),
     ):
         if (folder / name).is_file():
             return kind
     return SURVEY if next(folder.glob("*_map.csv"), None) else None
-
-
-def _kind_of_stages(folder: Path) -> Kind:
-    """The kind of a folder that magtwin made: that of a robot has layers in payloads/, and no map."""
-    robot = (folder / "payloads").is_dir() and not (folder / "robots").is_dir()
-    return ROBOT_FOLDER if robot else SCENE_FOLDER
 
 
 def _kind_of_yaml(path: Path) -> Kind:

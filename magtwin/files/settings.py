@@ -163,11 +163,8 @@ def _from_table(cls: type[T], table: dict[str, Any], where: "_Where") -> T:
         if key not in known:
             raise where.refused(key, f"unknown key {key!r}; {hint(key, known)}")
     for name, spec in known.items():
-        if (
-            name not in table
-            and spec.default is dataclasses.MISSING
-            and spec.default_factory is dataclasses.MISSING
-        ):
+        required = spec.default is spec.default_factory is dataclasses.MISSING
+        if required and name not in table:
             raise where.refused("", f"key {name!r} is missing; add it")
     values = {known[key].name: _value(hints[known[key].name], v, where, key) for key, v in table.items()}
     try:
@@ -300,13 +297,12 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
     if origin in (typing.Union, types.UnionType):
         some = [a for a in args if a is not type(None)]
         return _value(type(value) if type(value) in some else some[0], value, where, key)
+    table, many = dataclasses.is_dataclass(kind) or origin in (dict, Mapping), origin is tuple
+    if (table and not isinstance(value, dict)) or (many and not isinstance(value, list)):
+        raise wrong()
     if dataclasses.is_dataclass(kind):
-        if not isinstance(value, dict):
-            raise wrong()
         return _from_table(kind, value, where.inside(key))  # type: ignore[arg-type]
-    if origin is tuple:
-        if not isinstance(value, list):
-            raise wrong()
+    if many:
         if len(args) == 2 and args[1] is Ellipsis:
             args = (args[0],) * len(value)
         if len(args) != len(value):
@@ -314,10 +310,8 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
         if any(dataclasses.is_dataclass(a) for a in args):
             if not all(isinstance(v, dict) for v in value):
                 raise wrong()
-            return tuple(
-                _from_table(a, v, where.inside(key, k))
-                for k, (a, v) in enumerate(zip(args, value, strict=True))
-            )
+            each = enumerate(zip(args, value, strict=True))
+            return tuple(_from_table(a, v, where.inside(key, k)) for k, (a, v) in each)
         if set(args) == {float} and any(isinstance(v, str) for v in value):
             raise wrong()
         return tuple(_value(a, v, where, key) for a, v in zip(args, value, strict=True))
@@ -325,9 +319,7 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
         if value not in args:
             raise where.refused(key, f"{key} must be one of {', '.join(map(repr, args))}, got {value!r}")
         return value
-    if origin in (dict, Mapping):
-        if not isinstance(value, dict):
-            raise wrong()
+    if table:
         return {name: _value(args[1], entry, where.inside(key), name) for name, entry in value.items()}
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         if not abs(value) < 1e300:  # nan, inf, and too large integers
@@ -342,18 +334,11 @@ def _value(kind: Any, value: Any, where: _Where, key: str) -> Any:
 
 def _in_words(kind: Any) -> str:
     """An annotation in words."""
-    words = {
-        float: "a number",
-        int: "a whole number",
-        str: "a text",
-        bool: "true or false",
-        Path: "a file name",
-    }
+    words = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+    words[Path] = "a file name"
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if origin is tuple:
-        if args[-1] is Ellipsis:
-            return f"a list, each {_in_words(args[0])}"
-        return f"a list of {len(args)}, each {_in_words(args[0])}"
+        return f"a list{'' if args[-1] is Ellipsis else f' of {len(args)}'}, each {_in_words(args[0])}"
     if origin in (typing.Union, types.UnionType):
         return _in_words(next(a for a in args if a is not type(None)))
     return words.get(kind, "a table")

@@ -100,7 +100,8 @@ def _cells(region: Mask) -> list[list[tuple[int, int, int]]]:
     for i, row in enumerate(region):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], row.view(np.int8), [0]]))).reshape(-1, 2)
         runs = [(i, int(a), int(b)) for a, b in edges]
-        meets = [[k for k, cell in enumerate(open_cells) if _meet(cell[-1], run)] for run in runs]
+        ends = [cell[-1] for cell in open_cells]
+        meets = [[k for k, (_, a, b) in enumerate(ends) if a < run[2] and run[1] < b] for run in runs]
         met = [sum(k in ks for ks in meets) for k in range(len(open_cells))]
         now = list[list[tuple[int, int, int]]]()
         for run, ks in zip(runs, meets, strict=True):
@@ -114,19 +115,13 @@ def _cells(region: Mask) -> list[list[tuple[int, int, int]]]:
     return done + open_cells
 
 
-def _meet(one: tuple[int, int, int], other: tuple[int, int, int]) -> bool:
-    return one[1] < other[2] and other[1] < one[2]
-
-
 def _left_out(region: Mask, lanes: list[list[Lane]], strip: float) -> Iterator[Cells]:
     """Points from which the rest of the region is seen, the deepest in it first."""
     from scipy import ndimage
 
-    ends = [np.array([end for lane in cell for end in lane]) for cell in lanes]
     drawn = np.zeros(region.shape, bool)
-    for cell in ends:
-        for k in range(0, len(cell), 2):
-            drawn |= _drawn(region.shape, cell[k : k + 2])
+    for lane in (lane for cell in lanes for lane in cell):
+        drawn |= _drawn(region.shape, np.array(lane))
     rest = region & (ndimage.distance_transform_edt(~drawn) > strip / 2)
     spare = (1 - ENOUGH) * np.count_nonzero(region)
     depth = ndimage.distance_transform_edt(rest)
@@ -137,16 +132,8 @@ def _left_out(region: Mask, lanes: list[list[Lane]], strip: float) -> Iterator[C
         if rest[tuple(place)]:
             low = np.maximum(np.ceil(place - strip / 2), 0).astype(int)
             window = tuple(slice(a, int(p + strip / 2) + 1) for a, p in zip(low, place, strict=True))
-            away = np.hypot(
-                *np.meshgrid(
-                    *(
-                        np.arange(s.start, min(s.stop, n)) - p
-                        for s, n, p in zip(window, region.shape, place, strict=True)
-                    ),
-                    indexing="ij",
-                )
-            )
-            rest[window] &= away > strip / 2
+            away = np.indices(rest[window].shape) + (low - place)[:, None, None]
+            rest[window] &= np.hypot(*away) > strip / 2
             yield place
 
 

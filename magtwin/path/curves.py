@@ -76,7 +76,11 @@ def lawnmower(
     if not step_m > 0:
         raise InputError(f"step_m of a lawnmower must be above 0 m, got {step_m}")
     sweeps = abs(x_last_m - x_first_m) / step_m + 1
-    _check_points("lawnmower", 2 * sweeps, f"step_m {step_m:g} m from x {x_first_m:g} to {x_last_m:g} m")
+    if not 2 * sweeps <= MOST_POINTS:
+        what = (
+            f"step_m {step_m:g} m from x {x_first_m:g} to {x_last_m:g} m would make {2 * sweeps:.3g} points"
+        )
+        raise InputError(f"path 'lawnmower': {what}, more than {MOST_POINTS:,}")
     count = int(sweeps + 1e-9)
     x = np.repeat(x_first_m + math.copysign(step_m, x_last_m - x_first_m) * np.arange(count), 2)
     y = y_first_m + height_m * np.tile([0.0, 1.0, 1.0, 0.0], count)[: 2 * count]
@@ -110,18 +114,12 @@ def split_lawnmower(
             f"{y_last_m:g}, more than step_m {step_m:g} from both, got {y_split_m:g}"
         )
     margin = math.copysign(step_m / 2, near)
-    there = lawnmower(
-        x_first_m=x_first_m, x_last_m=x_last_m, y_first_m=y_first_m, height_m=near - margin, step_m=step_m
-    )
-    x_turn = float(there.p_xy[-1, 0])
-    back = lawnmower(
-        x_first_m=x_turn,
-        x_last_m=x_first_m,
-        y_first_m=y_split_m + margin,
-        height_m=far - margin,
-        step_m=step_m,
-    )
-    return Path("split_lawnmower", np.vstack([there.p_xy, back.p_xy]))
+    halves, ends = [], (x_first_m, x_last_m)
+    for y_m, height_m in ((y_first_m, near - margin), (y_split_m + margin, far - margin)):
+        sweeps = {"x_first_m": ends[0], "x_last_m": ends[1], "y_first_m": y_m, "height_m": height_m}
+        halves.append(lawnmower(step_m=step_m, **sweeps).p_xy)
+        ends = float(halves[0][-1, 0]), x_first_m
+    return Path("split_lawnmower", np.vstack(halves))
 
 
 @path("figure8")
@@ -228,15 +226,8 @@ def fast_sine() -> Path:
 
 
 # Paths of the cases in Table 1 of the neural magnetometer paper (Penumarti et al. 2025).
-CASES: Mapping[str, str] = MappingProxyType(
-    {
-        "A": "fast_sine",
-        "B": "curvilinear",
-        "C": "curvilinear_2",
-        "D": "split_lawnmower",
-        "E": "narrow_figure8",
-    }
-)
+_OF_CASES = ("fast_sine", "curvilinear", "curvilinear_2", "split_lawnmower", "narrow_figure8")
+CASES: Mapping[str, str] = MappingProxyType(dict(zip("ABCDE", _OF_CASES, strict=True)))
 
 
 def path_named(name: str) -> Path:
@@ -246,9 +237,3 @@ def path_named(name: str) -> Path:
         UnknownNameError: There is no such path; the text has the nearest name.
     """
     return PATHS[CASES.get(name, name)]()
-
-
-def _check_points(name: str, points: float, what: str) -> None:
-    """Refuse a path with too many points."""
-    if not points <= MOST_POINTS:
-        raise InputError(f"path {name!r}: {what} would make {points:.3g} points, more than {MOST_POINTS:,}")

@@ -82,13 +82,9 @@ class OccupancyGrid(Summarized):
         rows, columns = self.cells.shape
         share = [(self.cells == value).mean() for value in (FREE, OCCUPIED, UNKNOWN)]
         x, y = self.origin_m
-        return Summary(
-            f"OccupancyGrid: {columns} x {rows} cells of {self.resolution_m:g} m",
-            (
-                ("cells", "{:.1%} free, {:.1%} occupied, {:.1%} unknown".format(*share)),
-                ("origin", f"x {x:g}, y {y:g} m"),
-            ),
-        )
+        title = f"OccupancyGrid: {columns} x {rows} cells of {self.resolution_m:g} m"
+        cells = "{:.1%} free, {:.1%} occupied, {:.1%} unknown".format(*share)
+        return Summary(title, (("cells", cells), ("origin", f"x {x:g}, y {y:g} m")))
 
 
 def occupancy_of(room: Room, *, resolution_m: float | None = None) -> OccupancyGrid:
@@ -113,11 +109,8 @@ def occupancy_of(room: Room, *, resolution_m: float | None = None) -> OccupancyG
         raise InputError(f"resolution_m must be above 0 m, got {resolution_m!r}", parameter="resolution_m")
     low, count = _extent(room, resolution_m)
     if count.prod() > MOST_CELLS:
-        raise InputError(
-            f"{count[0]:.0f} x {count[1]:.0f} cells of {resolution_m:g} m are too many; at most "
-            f"{MOST_CELLS:,} are possible",
-            parameter="resolution_m",
-        )
+        text = f"{count[0]:.0f} x {count[1]:.0f} cells of {resolution_m:g} m are too many"
+        raise InputError(f"{text}; at most {MOST_CELLS:,} are possible", parameter="resolution_m")
     columns, rows = count.astype(int).tolist()
     x, y = ((low[k] + np.arange(n) + 0.5) * resolution_m for k, n in enumerate((columns, rows)))
     at = np.stack(np.meshgrid(x, y), axis=-1)

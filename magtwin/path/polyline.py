@@ -162,11 +162,9 @@ class Path(Summarized):
         ends = f"begins and ends at ({ax:z.2f}, {ay:z.2f}) m"
         if not self.closed:
             ends = f"({ax:z.2f}, {ay:z.2f}) to ({bx:z.2f}, {by:z.2f}) m"
-        return Summary(
-            f"Path {self.name}: {self.length:.4g} m, {'closed' if self.closed else 'open'}, "
-            f"{len(self.p_xy):,} points",
-            (("over", rectangle(x0, x1, y0, y1)), ("ends", ends), ("file", self.file)),
-        )
+        shape = f"{'closed' if self.closed else 'open'}, {len(self.p_xy):,} points"
+        rows = ("over", rectangle(x0, x1, y0, y1)), ("ends", ends), ("file", self.file)
+        return Summary(f"Path {self.name}: {self.length:.4g} m, {shape}", rows)
 
 
 def without_repeats(p: Array) -> Array:

@@ -92,13 +92,13 @@ def path_in(room: Room, path: str | os.PathLike[str]) -> Path:
     if room.lab.floor_m == FLOOR_M and not room.lab.floor and room.refusal(named) is None:
         return named
     made_for = np.asarray(FLOOR_M) / 2 - RADIUS_M
-    if min(room.reach_m) <= 0:
-        raise InputError(f"path {named.name} does not fit: {_too_small(room)}")
     whole = room.reach_m / made_for
     placed = _placed(named, room, whole, each_way=True)
     if not room.lab.floor and placed.placing == (*whole.tolist(), 0.0, 0.0):
         return placed  # as large as the floor
-    return replace(placed, swept=_swept(placed, named, room))
+    # Its share of the free floor, by that of the named path on the floor it is made for.
+    before = _around(named, Room(LabSpec(floor_m=FLOOR_M), RADIUS_M, Obstacles()))
+    return replace(placed, swept=round(min(1.0, _around(placed, room) / max(before, 1e-9)), 3))
 
 
 def fit_path(path: Path, room: Room) -> Path:
@@ -113,8 +113,6 @@ def fit_path(path: Path, room: Room) -> Path:
     """
     if room.refusal(path) is None:
         return path
-    if min(room.reach_m) <= 0:
-        raise InputError(f"path {path.name} does not fit: {_too_small(room)}")
     half = np.ptp(path.p_xy, axis=0) / 2
     with np.errstate(divide="ignore"):
         whole = min(1.0, float(np.min(room.reach_m / half)))
@@ -201,14 +199,12 @@ def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> 
         )
 
 
-def _too_small(room: Room) -> str:
-    return (
-        f"the floor of {room.lab.size_text} is no wider than a robot of radius {room.footprint_radius_m:g} m"
-    )
-
-
 def _placed(path: Path, room: Room, whole: Array, *, each_way: bool) -> Path:
     """The path at the largest size that fits, up to the scale `whole` (2,), near its original position."""
+    if min(room.reach_m) <= 0:
+        radius = f"a robot of radius {room.footprint_radius_m:g} m"
+        text = f"the floor of {room.lab.size_text} is no wider than {radius}"
+        raise InputError(f"path {path.name} does not fit: {text}")
     middle = (path.p_xy.min(axis=0) + path.p_xy.max(axis=0)) / 2
     half = np.ptp(path.p_xy, axis=0) / 2
     sizes = [(a, b) for a in SHRINK for b in (SHRINK if each_way else (a,))]
@@ -222,10 +218,11 @@ def _placed(path: Path, room: Room, whole: Array, *, each_way: bool) -> Path:
             shifts = _shifts(np.clip(start, -slack, slack), slack) - middle * scale + room.middle_m
             if each_way:  # first try the path scaled with the floor
                 shifts = np.vstack([room.middle_m, shifts])
-            dense = _dense(path, scale, max(free.step_m, 0.02))
+            scaled = path.placed((float(scale[0]), float(scale[1]), 0.0, 0.0))
+            count = min(math.ceil(scaled.length / max(free.step_m, 0.02)) + 1, 20_000)
+            dense = scaled.at(np.linspace(0.0, scaled.length * (1 - 1e-12), count))
             for shift in shifts[free.holds(dense, shifts)]:
-                numbers = (float(scale[0]), float(scale[1]), float(shift[0]), float(shift[1]))
-                found = path.placed(numbers)
+                found = path.placed(tuple(map(float, (*scale, *shift))))  # type: ignore[arg-type]
                 if room.refusal(found) is None:
                     return found
     raise InputError(
@@ -241,13 +238,6 @@ def _shifts(home: Array, slack: Array) -> Array:
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     away = np.round(np.hypot(*(grid - home).T), 9)
     return np.asarray(grid[np.lexsort((grid[:, 1], grid[:, 0], away))])
-
-
-def _dense(path: Path, scale: Array, step_m: float) -> Array:
-    """Points along a scaled path, a step apart, shape (N, 2)."""
-    scaled = path.placed((float(scale[0]), float(scale[1]), 0.0, 0.0))
-    count = min(math.ceil(scaled.length / step_m) + 1, 20_000)
-    return scaled.at(np.linspace(0.0, scaled.length * (1 - 1e-12), count))
 
 
 def _covering(room: Room) -> Path:
@@ -269,12 +259,9 @@ def _covering(room: Room) -> Path:
     for count, cell in found.closed:
         if (area := count * free.step_m**2) > LITTLE_M2:
             x, y = free.places(cell)
-            warnings.warn(
-                f"path {COVERAGE} cannot enter {area:.1f} m2 of the free floor about ({x:.2f}, {y:.2f}): "
-                f"{_closed_by(room, x, y)}",
-                MismatchWarning,
-                stacklevel=4,
-            )
+            part = f"{area:.1f} m2 of the free floor about ({x:.2f}, {y:.2f})"
+            text = f"path {COVERAGE} cannot enter {part}: {_closed_by(room, x, y)}"
+            warnings.warn(text, MismatchWarning, stacklevel=4)
     path = Path(COVERAGE, free.places(found.cells), swept=round(found.share, 3))
     if (error := room.refusal(path)) is not None:
         raise error
@@ -296,9 +283,7 @@ def coverage(*, length_m: float = 6.0, width_m: float = 3.5, footprint_radius_m:
 def _closed_by(room: Room, x: float, y: float) -> str:
     """Why a part of the floor cannot be entered, and what to do."""
     doors = [k for k, name in enumerate(room.obstacles.names) if name.endswith("/leaf")]
-    near = Obstacles(
-        tuple(room.obstacles.names[k] for k in doors), tuple(room.obstacles.outlines[k] for k in doors)
-    )
+    near = room.obstacles.only(doors)
     _, which = near.clearance([[x, y]])
     if which[0] < 0:
         return f"no way is {2 * room.footprint_radius_m:g} m wide; add a [[door]], or move what is in the way"
@@ -306,17 +291,8 @@ def _closed_by(room: Room, x: float, y: float) -> str:
     return f"the door nearest to it is {name}; open it (open_deg = 90), or make it wider (width_m)"
 
 
-def _swept(path: Path, named: Path, room: Room) -> float:
-    """Share of the free floor around a placed path, by that around the path on the floor it is made for.
-
-    The floor around a path is that inside its convex hull, and up to half a strip outside.
-    """
-    made_for = Room(LabSpec(floor_m=FLOOR_M), RADIUS_M, Obstacles())
-    return round(min(1.0, _around(path, room) / max(_around(named, made_for), 1e-9)), 3)
-
-
 def _around(path: Path, room: Room) -> float:
-    """Share of the places of a robot in a room that are inside a path's hull, or near it."""
+    """Share of the places of a robot in a room that are inside a path's hull, or half a strip outside."""
     free = _Free(room, 0.0, math.sqrt(4 * math.prod(room.half_m) / FEW_CELLS))
     places = free.places(np.argwhere(free.inside(room, 0.0)))
     hull = path.p_xy[:: max(1, len(path.p_xy) // 100)]
@@ -336,11 +312,11 @@ class _Free:
         at = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         inner = half - 1e-6  # an outline that only touches the floor's edge is outside
         kept = [
-            pair
-            for pair in zip(room.obstacles.names, room.obstacles.outlines, strict=True)
-            if room.lab.floor or (np.all(pair[1].max(0) > -inner) and np.all(pair[1].min(0) < inner))
+            k
+            for k, outline in enumerate(room.obstacles.outlines)
+            if room.lab.floor or (np.all(outline.max(0) > -inner) and np.all(outline.min(0) < inner))
         ]
-        standing = Obstacles(tuple(name for name, _ in kept), tuple(outline for _, outline in kept))
+        standing = room.obstacles.only(kept)
         # A point is at most this far from the nearest node of the raster.
         needed = room.footprint_radius_m + clear_m + self.step_m / math.sqrt(2)
         distance, _ = standing.clearance(at.reshape(-1, 2), reach_m=needed)

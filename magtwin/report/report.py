@@ -59,12 +59,8 @@ class Report(Summarized):
         """The figures; a notebook also shows the metadata."""
         metadata = [(str(name), str(value)) for name, value in self.metadata.items()]
         count = f" ({len(self.figures)} figures)" if len(self.figures) >= LINES else ""
-        return Summary(
-            f"{self.title}{count}",
-            (("verdict", self.verdict), *((f.name, _text(f)) for f in self.figures)),
-            ("fact", "value"),
-            metadata,
-        )
+        rows = (("verdict", self.verdict), *((f.name, _text(f)) for f in self.figures))
+        return Summary(f"{self.title}{count}", rows, ("fact", "value"), metadata)
 
 
 def key(name: str, unit: str = "") -> str:

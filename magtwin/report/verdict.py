@@ -108,11 +108,7 @@ class Tally:
     """Which robots the model's intervals hold for, of each kind of run once."""
 
     def add(
-        self,
-        error_nt: NDArray[Any],
-        naive_error_nt: NDArray[Any],
-        sd_nt: NDArray[Any],
-        intervals: str = OWN,
+        self, error_nt: NDArray[Any], naive_error_nt: NDArray[Any], sd_nt: NDArray[Any], intervals: str = OWN
     ) -> None:
         """Add the readings of a run, arrays of shape (N,); readings without a known error are left out."""
         known = np.isfinite(error_nt) & np.isfinite(naive_error_nt)
@@ -160,10 +156,8 @@ def recordings_text(
     sessions, paths = set(sessions), set(paths)
     text = f"{recordings} recordings"
     if learned_sessions is None or learned_paths is None:
-        return (
-            f"{text} of {len(sessions)} sessions and {len(paths)} paths; the weights do not say what they "
-            "were trained on"
-        )
-    new_sessions, new_paths = (len(sessions - set(learned_sessions)), len(paths - set(learned_paths)))
+        of = f"{len(sessions)} sessions and {len(paths)} paths"
+        return f"{text} of {of}; the weights do not say what they were trained on"
+    new_sessions, new_paths = len(sessions - set(learned_sessions)), len(paths - set(learned_paths))
     new = f"{new_sessions} of {len(sessions)} sessions and {new_paths} of {len(paths)} paths"
     return f"{text}; {new} are new to it"

@@ -100,24 +100,18 @@ class ExactField:
         """Metadata of a run on its true field; empty if Earth and sources make it."""
         if self.of != "map":
             return {}
+        added = "the whole platform field from the robot's spec, as a map without headings holds none"
         if self.holds_robot:
             added = (
                 "platform field from the robot's spec, without the part that the map holds from its survey"
             )
-        else:
-            added = "the whole platform field from the robot's spec, as a map without headings holds none"
-        if self.direction == "fit":
-            direction = "from the harmonic fit"
-            if self.scene.earth is None:
-                direction += ", unchecked, as there is no [earth]"
-        elif self.direction == "earth":
-            direction = "that of [earth]"
-            if self.anomaly_map.harmonic is not None:
-                direction += (
-                    f", as that of the harmonic fit is {np.degrees(self._bend):.0f} deg off (fit --earth)"
-                )
-        else:
-            direction = f"assumed {np.degrees(DIP):.0f} deg down towards +y, as there is no [earth]"
+        off = f", as that of the harmonic fit is {np.degrees(self._bend):.0f} deg off (fit --earth)"
+        direction = {
+            "fit": "from the harmonic fit"
+            + (", unchecked, as there is no [earth]" if self.scene.earth is None else ""),
+            "earth": "that of [earth]" + (off if self.anomaly_map.harmonic is not None else ""),
+            "assumed": f"assumed {np.degrees(DIP):.0f} deg down towards +y, as there is no [earth]",
+        }[self.direction]
         text = f"the fitted map; {added}; direction of the field {direction}"
         at, sensor = self.anomaly_map.height_m, self.scene.robot.base_height_m
         sensor += self.scene.robot.p_base_magnetometer[2]

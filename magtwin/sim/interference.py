@@ -128,10 +128,8 @@ def _known(scene: Scene) -> tuple[Array, Bodies]:
 def _known_earth(scene: Scene) -> EarthFieldSpec:
     """The Earth's field; refuse a scene without it."""
     if scene.earth is None:
-        raise InputError(
-            f"scene {scene.name!r} has no Earth's field, so its exact field is not known; "
-            "give it an [earth] table, or read the field from its map"
-        )
+        way = "give it an [earth] table, or read the field from its map"
+        raise InputError(f"scene {scene.name!r} has no Earth's field, so its exact field is not known; {way}")
     return scene.earth
 
 
@@ -224,11 +222,8 @@ def turning_iron_nt(robot: RobotSpec, wheel_angle: ArrayLike) -> Array:
         (platform.caster_moment, platform.caster_phase, platform.p_base_caster, rolled),
     ):
         if m:
-            now = turned + phase
-            field += _times(
-                np.column_stack([np.cos(now), np.sin(now)]),
-                m * _unit_fields(robot.name, robot.p_base_magnetometer, place),
-            )
+            unit, now = _unit_fields(robot.name, robot.p_base_magnetometer, place), turned + phase
+            field += _times(np.column_stack([np.cos(now), np.sin(now)]), m * unit)
     return field
 
 
@@ -364,22 +359,15 @@ def draw_platform(platform: PlatformFieldSpec, rng: np.random.Generator) -> Plat
     hard_iron += platform.hard_iron_std_nt * rng.standard_normal(3)
     motors, lidar, battery = 1 + platform.current_std * rng.standard_normal(3)
     angles = rng.uniform(0, 2 * math.pi, 4).tolist()
-    scaled = {
-        "left_motor_nt_nm": motors,
-        "right_motor_nt_nm": motors,
-        "lidar_nt": lidar,
-        "lidar_cos_nt": lidar,
-        "lidar_sin_nt": lidar,
-        "battery_nt": battery,
-    }
+    scaled = dict.fromkeys(("left_motor_nt_nm", "right_motor_nt_nm"), motors) | {"battery_nt": battery}
+    scaled |= dict.fromkeys(("lidar_nt", "lidar_cos_nt", "lidar_sin_nt"), lidar)
     fields = {name: tuple((np.array(getattr(platform, name)) * by).tolist()) for name, by in scaled.items()}
     names = ("left_wheel_phase", "right_wheel_phase", "caster_phase", "lidar_phase")
+    change = hard_iron - platform.hard_iron_nt + platform.hard_iron_change_nt
     return replace(
         platform,
         hard_iron_nt=tuple(hard_iron.tolist()),
-        hard_iron_change_nt=tuple(
-            (hard_iron - platform.hard_iron_nt + platform.hard_iron_change_nt).tolist()
-        ),
+        hard_iron_change_nt=tuple(change.tolist()),
         hard_iron_drift_nt=ZERO3,
         hard_iron_std_nt=0.0,
         current_std=0.0,

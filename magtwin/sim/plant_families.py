@@ -20,6 +20,12 @@ Array = NDArray[np.float64]
 SESSION_STD = 0.1
 """Relative spread between sessions, like `current_std` of the TurtleBot 4."""
 
+SPREADS = (
+    *("start_field_std_nt", "warm_up_age_mean_s", "session_std", "hard_iron_std_nt"),
+    *("current_direction_std", "marker_offset_std_m", "mocap_latency_std_s"),
+)
+"""Figures of a plant that say how sessions differ."""
+
 MOST_DIGITS = 18
 """Most digits of a seed in a text."""
 
@@ -51,10 +57,6 @@ def draw_plant(name: str, seed: int = 0, *, which: int = 0) -> PlantSpec:
 
 def _generator(entropy: Entropy, family: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(entropy, spawn_key=(family,)))
-
-
-def _nominal(entropy: Entropy) -> PlantSpec:
-    return PlantSpec()
 
 
 def _hysteresis(entropy: Entropy) -> PlantSpec:
@@ -139,7 +141,7 @@ def _all(entropy: Entropy) -> PlantSpec:
 
 
 PLANTS: Mapping[str, Callable[[Entropy], PlantSpec]] = {
-    "nominal": _nominal,
+    "nominal": lambda entropy: PlantSpec(),
     "hysteresis": _hysteresis,
     "warm-up": _warm_up,
     "nonlinear": _nonlinear,
@@ -177,20 +179,10 @@ def draw_session_plant(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
             ("moving_moment", factors[3]),
         )
     }
-    plant = replace(
-        plant,
-        **scaled,
-        start_field_nt=_numbers(start),
-        warm_up_age_s=float(age),
-        pan_phase=float(phase) if plant.moving_moment != ZERO3 else plant.pan_phase,
-        start_field_std_nt=0.0,
-        warm_up_age_mean_s=0.0,
-        session_std=0.0,
-        hard_iron_std_nt=0.0,
-        current_direction_std=0.0,
-        marker_offset_std_m=0.0,
-        mocap_latency_std_s=0.0,
-    )
+    if plant.moving_moment != ZERO3:
+        scaled["pan_phase"] = float(phase)
+    scaled |= {"start_field_nt": _numbers(start), "warm_up_age_s": float(age), **dict.fromkeys(SPREADS, 0.0)}
+    plant = replace(plant, **scaled)
     left, right, lidar, battery = turns
     turned: dict[str, Any] = {
         name: _numbers(matrix @ getattr(platform, name))
@@ -219,11 +211,8 @@ def plant_of(text: str, *, which: int = 0) -> PlantSpec:
         return from_table(PlantSpec, given, "plant")
     name, colon, seed = text.partition(":")
     if colon and not (seed.isascii() and seed.isdigit() and len(seed) <= MOST_DIGITS):
-        raise InputError(
-            f"plant must be NAME or NAME:SEED, SEED a whole number from 0 up with at most {MOST_DIGITS} "
-            f"digits; got {text[:60]!r}",
-            parameter="plant",
-        )
+        seeds = f"SEED a whole number from 0 up with at most {MOST_DIGITS} digits"
+        raise InputError(f"plant must be NAME or NAME:SEED, {seeds}; got {text[:60]!r}", parameter="plant")
     return draw_plant(name, int(seed or 0), which=which)
 
 

@@ -7,13 +7,14 @@ network was trained (its scalers, over 73 min of driving).
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from magtwin.sim.interference import draw_platform
 from magtwin.sim.motion.drive import draw_wheel_errors
 from magtwin.sim.plant_families import draw_session_plant
-from magtwin.spec.drive import DriveSpec
+from magtwin.spec.drive import DRAWN, DriveSpec
 from magtwin.spec.plant import PlantSpec
 from magtwin.spec.robot import RobotSpec
 
@@ -61,27 +62,17 @@ def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
     scale = 1.0 + drive.odometry_noise_std * draws["drive"].standard_normal(2)
     left, right = np.array(drive.odometry_scale) * scale
     forward, leftward = np.add(mocap.offset_m, mocap.offset_drift_m).tolist()
+    latency = mocap.latency_s + mocap.latency_drift_s
+    drifted: Any = {"offset_drift_m": (0.0, 0.0), "latency_drift_s": 0.0}
+    at_rest: Any = dict.fromkeys(DRAWN, 0.0)
     drawn = replace(
         robot,
         battery=replace(robot.battery, initial_fraction=max(1.0 - missing, LEAST_CHARGE)),
         imu=replace(imu, yaw_zero=yaw_zero, gyro_bias=tuple(bias.tolist())),
         lidar=replace(lidar, phase_s=phase),
         platform=draw_platform(robot.platform, draws["platform"]),
-        mocap=replace(
-            mocap,
-            offset_m=(forward, leftward),
-            latency_s=mocap.latency_s + mocap.latency_drift_s,
-            offset_drift_m=(0.0, 0.0),
-            latency_drift_s=0.0,
-        ),
-        drive=replace(
-            drive,
-            wheel_errors=errors,
-            wheel_radius_error_std=0.0,
-            wheel_separation_error_std=0.0,
-            odometry_scale=(float(left), float(right)),
-            odometry_noise_std=0.0,
-        ),
+        mocap=replace(mocap, offset_m=(forward, leftward), latency_s=latency, **drifted),
+        drive=replace(drive, wheel_errors=errors, odometry_scale=(float(left), float(right)), **at_rest),
     )
     if robot.plant == PlantSpec():
         return drawn
@@ -92,9 +83,8 @@ def draw_session(robot: RobotSpec, rng: np.random.Generator) -> RobotSpec:
 def session_of(robot: RobotSpec, seed: int, session: int, *, which: int = 0) -> RobotSpec:
     """The robot in a numbered session of a data set."""
     key = (0, session, which) if which else (0, session)
-    return draw_session(
-        robot, np.random.default_rng(np.random.SeedSequence((seed, 1), spawn_key=key))
-    )  # a child that no run draws from
+    child = np.random.SeedSequence((seed, 1), spawn_key=key)  # that no run draws from
+    return draw_session(robot, np.random.default_rng(child))
 
 
 def offset_generator(

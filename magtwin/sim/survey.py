@@ -89,15 +89,11 @@ def visit(
         if not 0 <= sd < np.inf:
             raise InputError(f"{name} must not be below 0, got {sd!r}", parameter=name)
     if position_error_m > spacing_m > 0:
-        raise InputError(
-            f"position_error_m {position_error_m!r} is above the spacing of {spacing_m!r} m; the robot "
-            "would not find its nodes"
-        )
+        text = f"is above the spacing of {spacing_m!r} m; the robot would not find its nodes"
+        raise InputError(f"position_error_m {position_error_m!r} {text}")
     if heading_error_rad > np.pi / 2:
-        raise InputError(
-            f"heading_error_rad must not be above pi/2, got {heading_error_rad!r}",
-            parameter="heading_error_rad",
-        )
+        text = f"heading_error_rad must not be above pi/2, got {heading_error_rad!r}"
+        raise InputError(text, parameter="heading_error_rad")
     height = sensor_height_m(scene) if height_m is None else height_m
     if not 0 <= height < np.inf:
         raise InputError(f"height_m must be a height above the floor, 0 m or more, got {height!r}")
@@ -239,9 +235,8 @@ def pose_error_nt2(
     if not spread.any():
         return total
     lever = np.asarray(scene.robot.p_base_magnetometer)[:2]
-    around = _parabola(
-        scene, grid, height_m, max(float(np.hypot(*lever)) + 2 * position_error_m, LEAST_REACH_M)
-    )
+    reach = max(float(np.hypot(*lever)) + 2 * position_error_m, LEAST_REACH_M)
+    around = _parabola(scene, grid, height_m, reach)
 
     def field(off: Array, yaw: float) -> Array:
         """Magnitude with base_link at an offset from its nodes [nT], shape (Y, X)."""
@@ -326,15 +321,12 @@ class Surveyed:
         field = self.field
         headings, rows, columns = field.values_nt.shape
         low, high = field.values_nt.min() / 1000, field.values_nt.max() / 1000
-        holes = (
-            f"; {self.filled} nodes in steel or where no robot can stand are filled from their neighbours"
-            * (self.filled > 0)
-        )
+        holes = f"; {self.filled} nodes in steel or where no robot can stand are filled from their neighbours"
+        none = "; nothing is magnetised, so the field is the same everywhere"
         return (
             f"surveyed by its own robot: {columns} x {rows} nodes {field.cell_m[0]:g} m apart, {headings} "
-            f"headings, {field.height_m:.3g} m above the floor, {low:.2f} to {high:.2f} uT{holes}"
-            + "; nothing is magnetised, so the field is the same everywhere"
-            * (not self.magnets)
+            f"headings, {field.height_m:.3g} m above the floor, {low:.2f} to {high:.2f} uT"
+            f"{holes if self.filled else ''}{'' if self.magnets else none}"
         )
 
 
@@ -391,15 +383,12 @@ def blocked_by(scene: Scene, obstacles: Obstacles) -> Callable[[Array], NDArray[
         A function from nodes [m], shape (..., 2), to whether each is blocked, shape (...).
     """
     half, floor = np.array(scene.lab.floor_m) / 2, scene.lab.floor
-    inner = [
-        k for k, o in enumerate(obstacles.outlines) if np.all(np.abs(_nearest_to_middle(o)) < half - 1e-6)
-    ]
+    nearest = [np.clip(0.0, o.min(axis=0), o.max(axis=0)) for o in obstacles.outlines]  # to the middle
+    inner = [k for k, p in enumerate(nearest) if np.all(np.abs(p) < half - 1e-6)]
     if floor:
         sides = [side.name for side in scene.lab.sides]
         inner = [k for k, name in enumerate(obstacles.names) if name.split("/")[-2] not in sides]
-    standing = Obstacles(
-        tuple(obstacles.names[k] for k in inner), tuple(obstacles.outlines[k] for k in inner)
-    )
+    standing = obstacles.only(inner)
     radius = scene.robot.footprint_radius_m
 
     def blocked(nodes: Array) -> NDArray[np.bool_]:
@@ -410,8 +399,3 @@ def blocked_by(scene: Scene, obstacles: Obstacles) -> Callable[[Array], NDArray[
         return np.asarray((distance < radius) | inside | off).reshape(nodes.shape[:-1])
 
     return blocked
-
-
-def _nearest_to_middle(outline: Array) -> Array:
-    """The point of an outline's box nearest to the origin, shape (2,)."""
-    return np.clip(0.0, outline.min(axis=0), outline.max(axis=0))

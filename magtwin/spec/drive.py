@@ -4,6 +4,9 @@ from dataclasses import dataclass, field
 
 from magtwin.spec.base import LATER, Spec, Vec2, Vec3
 
+DRAWN = ("wheel_radius_error_std", "wheel_separation_error_std", "odometry_noise_std")
+"""Spreads from which a run draws; 0 in a session, which has drawn."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class DriveSpec(Spec):

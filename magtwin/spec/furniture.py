@@ -169,17 +169,9 @@ def _shelf() -> Iterator[Part]:
         yield Part(f"board_{k}", (0, 0, z), (deep, inner, board), "Door", fill=0.2)
 
 
-KINDS: Mapping[str, Callable[[], Iterator[Part]]] = MappingProxyType(
-    {
-        "desk": _desk,
-        "chair": _chair,
-        "cabinet": _cabinet,
-        "column": _column,
-        "radiator": _radiator,
-        "door_frame": _door_frame,
-        "shelf": _shelf,
-    }
-)
+_MAKERS: tuple[Callable[[], Iterator[Part]], ...]
+_MAKERS = _desk, _chair, _cabinet, _column, _radiator, _door_frame, _shelf
+KINDS = MappingProxyType({make.__name__.removeprefix("_"): make for make in _MAKERS})
 """Functions that make the parts of each kind, without the generic ones."""
 
 
@@ -234,15 +226,8 @@ def _mesh_part(look: str, size_m: Vec3, vertices_m: tuple[Vec3, ...], faces: tup
     if np.abs(middle).max() > 1e-6 * (high - low).max():  # rounding; a mesh that was centred stays as it is
         points = (points - middle).astype(np.float32).astype(float)
     x, y, z = (float(side) for side in high - low)
-    return Part(
-        BODY,
-        (0.0, 0.0, z / 2),
-        (x, y, z),
-        look,
-        "mesh",
-        vertices_m=tuple(map(tuple, points.tolist())),
-        faces=faces,
-    )
+    vertices = tuple(map(tuple, points.tolist()))
+    return Part(BODY, (0.0, 0.0, z / 2), (x, y, z), look, "mesh", vertices_m=vertices, faces=faces)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -286,11 +271,8 @@ class FurnitureSpec(Spec):
         self._not_negative("susceptibility")
         steel = [part.name for part in self.parts if part.steel]
         fits = len(self.magnetization) in (0, len(steel))
-        what = (
-            f"have one number for each of {', '.join(steel)}"
-            if steel
-            else "be left out: the piece has no steel"
-        )
+        what = f"have one number for each of {', '.join(steel)}"
+        what = what if steel else "be left out: the piece has no steel"
         self._require("magnetization", fits, what, self.magnetization)
         if not any(self.magnetization):
             object.__setattr__(self, "magnetization", ())
@@ -301,13 +283,8 @@ class FurnitureSpec(Spec):
     @property
     def parts(self) -> tuple[Part, ...]:
         """The parts of the piece."""
-        return parts_of(
-            self.kind,
-            material=self.material,
-            size_m=self.size_m,
-            vertices_m=self.vertices_m,
-            faces=self.faces,
-        )
+        shape = {"size_m": self.size_m, "vertices_m": self.vertices_m, "faces": self.faces}
+        return parts_of(self.kind, material=self.material, **shape)  # type: ignore[arg-type]
 
     def sources(self, *, in_world: bool = True) -> tuple[SourceSpec, ...]:
         """One source for each steel part, named after the piece and the part.
@@ -316,24 +293,39 @@ class FurnitureSpec(Spec):
             in_world: Whether positions and axes are in world; otherwise they are in the axes of the piece.
         """
         steel = [part for part in self.parts if part.steel]
-        turn = self.q_world_xyzw if in_world else IDENTITY_XYZW
-        sources = []
-        for part, m in zip(steel, self.magnetization or (0.0,) * len(steel), strict=True):
-            x, y, z = rotate(turn, part.p) + self.p_world if in_world else map(float, part.p)
-            sources.append(
-                SourceSpec(
-                    name=f"{self.name}_{part.name}",
-                    p_world=(float(x), float(y), float(z)),
-                    shape=part.shape,
-                    q_world_xyzw=turn,
-                    size_m=ZERO3 if part.faces else part.size_m,
-                    vertices_m=part.vertices_m,
-                    faces=part.faces,
-                    magnetization=tuple(m * (k == part.along) for k in range(3)),  # type: ignore[arg-type]
-                    susceptibility=self.susceptibility,
-                )
-            )
-        return tuple(sources)
+        at = (self.p_world, self.q_world_xyzw) if in_world else None
+        return tuple(
+            source_of(part, f"{self.name}_{part.name}", at, m, part.along, self.susceptibility)
+            for part, m in zip(steel, self.magnetization or (0.0,) * len(steel), strict=True)
+        )
+
+
+def source_of(
+    part: Part, name: str, at: tuple[Vec3, Quat] | None, m: float, along: int, susceptibility: float
+) -> SourceSpec:
+    """The source of a steel part.
+
+    Args:
+        part: The part.
+        name: Name of the source.
+        at: Origin [m] and axes in world of what the part belongs to. None: the source stays in these axes.
+        m: Magnetization [A/m].
+        along: Axis of the magnetization, 0 to 2.
+        susceptibility: Volume susceptibility [1].
+    """
+    p_world, turn = (ZERO3, IDENTITY_XYZW) if at is None else at
+    x, y, z = map(float, part.p if at is None else rotate(turn, part.p) + p_world)
+    return SourceSpec(
+        name=name,
+        p_world=(x, y, z),
+        shape=part.shape,
+        q_world_xyzw=turn,
+        size_m=ZERO3 if part.faces else part.size_m,
+        vertices_m=part.vertices_m,
+        faces=part.faces,
+        magnetization=tuple(m * (k == along) for k in range(3)),  # type: ignore[arg-type]
+        susceptibility=susceptibility,
+    )
 
 
 @lru_cache(maxsize=1024)

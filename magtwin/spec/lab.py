@@ -118,11 +118,9 @@ class LabSpec(Spec):
         if not self.wall_height_m:
             return ()
         thick, corners = self.wall_thickness_m, self.corners
-        names = (
-            [f"edge_{k}" for k in range(len(corners))] if self.floor else ["south", "east", "north", "west"]
-        )
+        names = [f"edge_{k}" for k in range(len(corners))]
         walls = []
-        for k, name in enumerate(names):
+        for k, name in enumerate(names if self.floor else ("south", "east", "north", "west")):
             (x0, y0), (x1, y1), (x2, y2) = (corners[(k + j) % len(corners)] for j in range(3))
             along, turn = math.atan2(y1 - y0, x1 - x0), math.atan2(y2 - y1, x2 - x1)
             bend = math.remainder(turn - along, math.tau)

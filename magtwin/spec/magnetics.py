@@ -187,10 +187,8 @@ class SourceSpec(Summarized, Spec):
         self._named("shape", ("point", *SHAPES))
         self._unit("q_world_xyzw")
         self._not_negative("susceptibility")
-        if self.shape != "mesh":
-            self._require(
-                "vertices_m", not (self.vertices_m or self.faces), "be given for shape mesh only", "some"
-            )
+        fits = self.shape == "mesh" or not (self.vertices_m or self.faces)
+        self._require("vertices_m", fits, "be given for shape mesh only", "some")
         if self.shape == "point":
             for name, none in {"size_m": ZERO3, "magnetization": ZERO3, "susceptibility": 0.0}.items():
                 value = getattr(self, name)

@@ -15,17 +15,13 @@ def check_mesh(vertices: NDArray[np.float64], faces: NDArray[np.intp], what: str
         what: How the text of a refusal begins: "source 'desk'".
     """
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or faces.ndim != 2 or faces.shape[1:] != (3,):
-        raise InputError(
-            f"{what} needs vertices (V, 3) and triangles (F, 3), got {vertices.shape} and {faces.shape}"
-        )
-    if not np.isfinite(vertices).all():
-        raise InputError(
-            f"{what} must have finite vertices, got {vertices[~np.isfinite(vertices).all(axis=1)][0]}"
-        )
+        shapes = f"{vertices.shape} and {faces.shape}"
+        raise InputError(f"{what} needs vertices (V, 3) and triangles (F, 3), got {shapes}")
+    if len(wrong := vertices[~np.isfinite(vertices).all(axis=1)]):
+        raise InputError(f"{what} must have finite vertices, got {wrong[0]}")
     if not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(
-            f"{what} has {len(faces)} triangles that name corners beyond its {len(vertices)} vertices"
-        )
+        beyond = f"beyond its {len(vertices)} vertices"
+        raise InputError(f"{what} has {len(faces)} triangles that name corners {beyond}")
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     there, seen = np.unique(edges @ [len(vertices), 1], return_counts=True)
     back = np.unique(edges[:, ::-1] @ [len(vertices), 1])

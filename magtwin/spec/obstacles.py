@@ -60,18 +60,21 @@ class Obstacles(Summarized):
             nearest obstacle, -1 if there is none; each of shape (N,).
         """
         p = np.asarray(p_xy, float)
+        x, y = p.T
         nearest, which = np.full(len(p), np.inf), np.full(len(p), -1)
         for i, outline in enumerate(self.outlines):
             low, high = outline.min(axis=0) - reach_m, outline.max(axis=0) + reach_m
-            rows = np.flatnonzero(
-                (p[:, 0] >= low[0]) & (p[:, 0] <= high[0]) & (p[:, 1] >= low[1]) & (p[:, 1] <= high[1])
-            )
+            rows = np.flatnonzero((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1]))
             if not len(rows):
                 continue
             distance = _distance(p[rows], outline)
             closer = (distance < nearest[rows]) & (distance <= reach_m)
             nearest[rows[closer]], which[rows[closer]] = distance[closer], i
         return nearest, which
+
+    def only(self, which: Sequence[int]) -> "Obstacles":
+        """Some of them, by their numbers, without their surfaces."""
+        return Obstacles(tuple(self.names[k] for k in which), tuple(self.outlines[k] for k in which))
 
     @functools.cached_property
     def edges(self) -> tuple[Array, NDArray[np.intp]]:
@@ -84,9 +87,8 @@ class Obstacles(Summarized):
 
     def _summary(self) -> Summary:
         names = ["/".join(name.split("/")[-2:]) for name in self.names]
-        return Summary(
-            f"Obstacles: {len(self)}, {len(self.triangles):,} triangles", (("names", listed(names, 80)),)
-        )
+        title = f"Obstacles: {len(self)}, {len(self.triangles):,} triangles"
+        return Summary(title, (("names", listed(names, 80)),))
 
 
 def _distance(p: Array, outline: Array) -> Array:

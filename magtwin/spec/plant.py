@@ -114,12 +114,8 @@ class PlantSpec(Spec):
         if any(self.moving_moment):
             x, y, z = self.p_magnetometer_moving
             apart = (abs((x * x + y * y) ** 0.5 - self.moving_arm_m) ** 2 + z * z) ** 0.5
-            self._require(
-                "p_magnetometer_moving",
-                apart > 1e-3,
-                "keep the moving part more than 1 mm from the magnetometer",
-                self.p_magnetometer_moving,
-            )
+            what = "keep the moving part more than 1 mm from the magnetometer"
+            self._require("p_magnetometer_moving", apart > 1e-3, what, self.p_magnetometer_moving)
 
     def _count(self, name: str, like: str, per: int) -> None:
         """Require `per` numbers in the field `name` for each number in the field `like`."""

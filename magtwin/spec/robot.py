@@ -1,7 +1,9 @@
 """A robot: its USD asset, drive, sensors and magnetic field; and its place in a scene."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from magtwin.frames import IDENTITY_XYZW, quat_multiply, rotate
 from magtwin.report.summary import Summarized, Summary
@@ -97,26 +99,17 @@ class RobotSpec(Summarized, Spec):
         """Name and magnetometer; drive; other sensors; asset."""
         sensor, drive = self.magnetometer, self.drive
         network = "" if sensor.network is None else f" ({sensor.network.name})"
-        x, y, z = self.p_base_magnetometer
-        return Summary(
-            f"RobotSpec {self.name}: {sensor.kind} magnetometer{network} at {sensor.rate_hz:g} Hz",
-            (
-                (
-                    "sensor",
-                    f"({x:.3g}, {y:.3g}, {z:.3g}) m in base_link, {sensor.noise_density_nt:.3g} nT/sqrt(Hz)",
-                ),
-                (
-                    "drive",
-                    f"{drive.v_max:.3g} m/s, {drive.w_max:.3g} rad/s, radius {self.footprint_radius_m:.3g} m",
-                ),
-                (
-                    "others",
-                    f"LiDAR {self.lidar.rays} rays, IMU {self.imu.rate_hz:g} Hz, "
-                    f"battery {self.battery.capacity_wh:g} Wh",
-                ),
-                ("asset", str(self.asset)),
-            ),
-        )
+        place = "({:.3g}, {:.3g}, {:.3g}) m in base_link".format(*self.p_base_magnetometer)
+        radius = f"radius {self.footprint_radius_m:.3g} m"
+        others = f"LiDAR {self.lidar.rays} rays, IMU {self.imu.rate_hz:g} Hz"
+        rows = {
+            "sensor": f"{place}, {sensor.noise_density_nt:.3g} nT/sqrt(Hz)",
+            "drive": f"{drive.v_max:.3g} m/s, {drive.w_max:.3g} rad/s, {radius}",
+            "others": f"{others}, battery {self.battery.capacity_wh:g} Wh",
+            "asset": str(self.asset),
+        }
+        title = f"RobotSpec {self.name}: {sensor.kind} magnetometer{network} at {sensor.rate_hz:g} Hz"
+        return Summary(title, tuple(rows.items()))
 
 
 def _product(a: Quat, b: Quat) -> Quat:
@@ -135,3 +128,9 @@ class PlacedRobot(Summarized, Spec):
 
     path: str | Path = ""
     """Default path: a name of `magtwin.path.PATHS`, "random", or a CSV file; "" for the caller's default."""
+
+
+def fields_of(robots: Sequence[PlacedRobot]) -> dict[str, Any]:
+    """The fields of a `Scene` with these robots, by name."""
+    first, *others = robots
+    return {"robot": first.robot, "start": first.start, "path": first.path, "others": tuple(others)}

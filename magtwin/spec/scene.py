@@ -2,7 +2,7 @@
 
 import importlib
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ from magtwin.spec.base import ZERO3, Spec, Vec3
 from magtwin.spec.furniture import FurnitureSpec, steel_of
 from magtwin.spec.lab import LabSpec
 from magtwin.spec.magnetics import EarthFieldSpec, SourceSpec
-from magtwin.spec.robot import PlacedRobot, RobotSpec
+from magtwin.spec.robot import PlacedRobot, RobotSpec, fields_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -66,11 +66,16 @@ class Scene(Summarized, Spec):
         """Every robot, `robot` first."""
         return (PlacedRobot(robot=self.robot, start=self.start, path=self.path), *self.others)
 
+    def with_robots(self, change: Callable[[int, RobotSpec], RobotSpec]) -> "Scene":
+        """The scene with each robot as `change` makes it of its number, from 0, and its spec."""
+        robots = [replace(placed, robot=change(k, placed.robot)) for k, placed in enumerate(self.robots)]
+        return replace(self, **fields_of(robots))
+
     def led_by(self, name: str) -> "Scene":
         """The scene with the robot called `name` as the first robot."""
         placed = find("robot", name, {placed.robot.name: placed for placed in self.robots})
-        rest = tuple(other for other in self.robots if other.robot.name != name)
-        return replace(self, robot=placed.robot, start=placed.start, path=placed.path, others=rest)
+        rest = [other for other in self.robots if other.robot.name != name]
+        return replace(self, **fields_of([placed, *rest]))
 
     def with_(self, changes: Mapping[str, Any] | None = None, **values: Any) -> "Scene":
         """The scene with something changed. The map stays: `open_twin` warns where and by how much it is off.
@@ -87,10 +92,8 @@ class Scene(Summarized, Spec):
             InputError: There is no such field or thing; a value has the wrong type or size, or a piece of
                 furniture does not stand on the floor.
         """
-        made: Scene = importlib.import_module("magtwin.author.rooms").changed(
-            self, {**(changes or {}), **values}
-        )
-        return made
+        rooms = importlib.import_module("magtwin.author.rooms")
+        return rooms.changed(self, {**(changes or {}), **values})  # type: ignore[no-any-return]
 
     def to_toml(self, out: str | os.PathLike[str] | None = None, *, force: bool = False) -> str:
         """The scene as the text of a TOML, of which `magtwin.scene_from_toml` makes the same scene.
@@ -110,21 +113,17 @@ class Scene(Summarized, Spec):
         """Name and floor; robots; map; field; paths; furniture."""
         robots = [f"{p.robot.name} ({p.robot.magnetometer.kind} magnetometer)" for p in self.robots]
         field = "no Earth's field" if self.earth is None else f"Earth's field of {self.earth.date}"
-        return Summary(
-            f"Scene {self.name}: floor {self.lab.size_text}",
-            (
-                ("robots" if self.others else "robot", listed(robots, 80)),
-                ("map", str(self.map_layer)),
-                (
-                    "field",
-                    f"{field}, {len(self.sources):,} sources, {len(self.furniture):,} pieces of furniture",
-                ),
-                ("path", listed([str(placed.path) or "not set" for placed in self.robots])),
-                ("furniture", listed([piece.name for piece in self.furniture], 200)),
-                ("walls", listed([wall.name for wall in self.lab.walls], 80)),
-                ("doors", listed([f"{door.name} at {door.open_deg:g} deg" for door in self.lab.doors], 80)),
-            ),
-        )
+        things = f"{len(self.sources):,} sources, {len(self.furniture):,} pieces of furniture"
+        rows = {
+            "robots" if self.others else "robot": listed(robots, 80),
+            "map": str(self.map_layer),
+            "field": f"{field}, {things}",
+            "path": listed([str(placed.path) or "not set" for placed in self.robots]),
+            "furniture": listed([piece.name for piece in self.furniture], 200),
+            "walls": listed([wall.name for wall in self.lab.walls], 80),
+            "doors": listed([f"{door.name} at {door.open_deg:g} deg" for door in self.lab.doors], 80),
+        }
+        return Summary(f"Scene {self.name}: floor {self.lab.size_text}", tuple(rows.items()))
 
     @property
     def magnets(self) -> tuple[SourceSpec, ...]:

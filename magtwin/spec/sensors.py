@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from magtwin.errors import InputError
 from magtwin.frames import IDENTITY_XYZW
 from magtwin.spec.base import ZERO3, ZERO9, Matrix3, Quat, Spec, Vec2, Vec3
 
@@ -232,7 +231,6 @@ class LidarSpec(MountSpec):
         self._above_zero("scan_rate_hz", "range_max_m")
         self._not_negative("range_min_m", "range_noise_std_m", "latency_s", "jitter_s")
         self._not_negative("on_s", "off_s", "phase_s")
-        self._require("rays", isinstance(self.rays, int), "be a whole number", self.rays)
         self._within("rays", 1, MOST_RAYS)
         low, high = self.range_min_m, self.range_max_m
         self._require("range_min_m", low < high, f"be below range_max_m {high!r}", low)
@@ -342,10 +340,8 @@ class MocapSpec(Spec):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._above_zero("rate_hz")
-        if self.latency_s + self.latency_drift_s < 0:
-            raise InputError(
-                f"latency_drift_s of MocapSpec must not make the latency of {self.latency_s} s negative, "
-                f"got {self.latency_drift_s}"
-            )
+        what = f"not make the latency of {self.latency_s} s negative"
+        drift = self.latency_drift_s
+        self._require("latency_drift_s", self.latency_s + drift >= 0, what, drift)
         self._not_negative("latency_s", "jitter_s", "p_noise_std_m", "angle_noise_std")
         self._not_negative("dropout_every_s", "dropout_s")

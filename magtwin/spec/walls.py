@@ -8,9 +8,9 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from magtwin.errors import InputError, find, hint
-from magtwin.frames import IDENTITY_XYZW, quat_from_yaw, rotate
+from magtwin.frames import quat_from_yaw
 from magtwin.spec.base import KEY, Quat, Spec, Vec2
-from magtwin.spec.furniture import MATERIALS, STEEL, Part
+from magtwin.spec.furniture import MATERIALS, STEEL, Part, source_of
 from magtwin.spec.magnetics import SourceSpec
 
 NO_LEAF = "none"
@@ -80,7 +80,7 @@ class Wall(Spec):
 
 
 @dataclass(frozen=True)
-class _Opening:
+class _Opening(Spec):
     """An opening in a wall."""
 
     wall: str | int
@@ -91,9 +91,19 @@ class _Opening:
     """Middle of the opening, from the wall's start [m]."""
 
     _: KW_ONLY
+
     name: str = ""
+    """Name of its prim, used once. Default: door_0 for the first door, window_1 for the second window."""
+
     width_m: float = 0.9
+    """Width of the opening [m]."""
+
     height_m: float = 2.0
+    """Height of the opening, and of a door's leaf [m]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._above_zero("width_m", "height_m")
 
     @property
     def span_m(self) -> Vec2:
@@ -102,19 +112,10 @@ class _Opening:
 
 
 @dataclass(frozen=True)
-class Door(_Opening, Spec):
+class Door(_Opening):
     """A door in a wall: an opening from the floor up, with a leaf that turns."""
 
     _: KW_ONLY
-
-    name: str = ""
-    """Name of its prim, used once. Default: door_0 for the first door, door_1 for the second."""
-
-    width_m: float = 0.9
-    """Width of the opening [m]."""
-
-    height_m: float = 2.0
-    """Height of the opening and of the leaf [m]."""
 
     open_deg: float = 90.0
     """Angle of the leaf, from -180 to 180 [deg]; 0 is closed. Above 0 it turns to the left of the wall, seen
@@ -137,7 +138,7 @@ class Door(_Opening, Spec):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._above_zero("width_m", "height_m", "thickness_m")
+        self._above_zero("thickness_m")
         self._not_negative("susceptibility")
         self._within("open_deg", -180, 180)
         self._named("hinge", ("start", "end"))
@@ -165,13 +166,10 @@ class Door(_Opening, Spec):
 
 
 @dataclass(frozen=True)
-class Window(_Opening, Spec):
+class Window(_Opening):
     """A window in a wall: an opening without glass above a sill. One with a sill of 0 is a passage."""
 
     _: KW_ONLY
-
-    name: str = ""
-    """Name, used once. Default: window_0 for the first window, window_1 for the second."""
 
     width_m: float = 1.2
     """Width of the opening [m]."""
@@ -184,7 +182,6 @@ class Window(_Opening, Spec):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._above_zero("width_m", "height_m")
         self._not_negative("sill_m")
 
 
@@ -238,17 +235,8 @@ def sources_of_wall(
     """
 
     def source(name: str, part: Part, at: Vec2, yaw: float, along: int, of: Wall | Door) -> SourceSpec:
-        turn = _turned(yaw) if in_world else IDENTITY_XYZW
-        x, y, z = map(float, np.add(rotate(turn, part.p), (*at, 0.0)) if in_world else part.p)
-        return SourceSpec(
-            name=f"{wall.name}_{name}" if in_world else name,
-            p_world=(x, y, z),
-            shape="cuboid",
-            q_world_xyzw=turn,
-            size_m=part.size_m,
-            magnetization=tuple(of.magnetization * (k == along) for k in range(3)),  # type: ignore[arg-type]
-            susceptibility=of.susceptibility,
-        )
+        name, place = (f"{wall.name}_{name}", ((*at, 0.0), _turned(yaw))) if in_world else (name, None)
+        return source_of(part, name, place, of.magnetization, along, of.susceptibility)
 
     parts = parts_of_wall(wall, openings) if MATERIALS[wall.material] in STEEL else ()
     sources = [source(part.name, part, wall.start, wall.yaw, 0, wall) for part in parts]
@@ -312,18 +300,28 @@ class Structure:
 
     def faults(self) -> Iterator[Fault]:
         """What is wrong, in order."""
-        yield from self._names()
-        for number, opening in enumerate(self.openings()):
-            if isinstance(opening, Door):
-                yield from self._misplaced("door", number, opening)
-            else:
-                yield from self._misplaced("window", number - len(self.doors), opening)
+        tables: dict[str, Sequence[Wall | Door | Window]]
+        tables = {"wall": self.walls, "door": self.doors, "window": self.windows}
+        things = [(section, k, thing) for section in tables for k, thing in enumerate(tables[section])]
+        taken = {wall.name.casefold() for wall in self.sides}
+        for section, number, thing in things:
+            if not (thing.name.isidentifier() and thing.name.isascii()):
+                text = f"{section} {thing.name!r} cannot name a prim; use letters, digits and _"
+                yield section, number, "name", text
+            if thing.name.casefold() in taken:
+                text = f"{section} {thing.name!r} has a name that is taken; give each its own"
+                yield section, number, "name", text
+            taken.add(thing.name.casefold())
+        for section, number, thing in things:
+            if not isinstance(thing, Wall):
+                yield from self._misplaced(section, number, thing)
         yield from self._crossed()
 
     def _crossed(self) -> Iterator[Fault]:
         """Walls that stand in an opening of another wall; touching is not standing in it."""
         openings, none = self.openings(), np.empty((0, 4, 2))
-        holes = np.array([_hole(self.wall_of(each), each) for each in openings]) if openings else none
+        held = [corners_of(self.wall_of(each), each.span_m) for each in openings]
+        holes = np.array(held) if openings else none
         low, high = holes.min(axis=1) - SAME_M, holes.max(axis=1) + SAME_M
         for number, wall in enumerate(self.walls if openings else ()):
             corners = corners_of(wall)
@@ -357,23 +355,6 @@ class Structure:
         """
         return find("wall", str(opening.wall), self._known)
 
-    def _names(self) -> Iterator[Fault]:
-        taken = {wall.name.casefold() for wall in self.sides}
-        tables: tuple[tuple[str, Sequence[Wall | Door | Window]], ...] = (
-            ("wall", self.walls),
-            ("door", self.doors),
-            ("window", self.windows),
-        )
-        for section, things in tables:
-            for number, thing in enumerate(things):
-                if not (thing.name.isidentifier() and thing.name.isascii()):
-                    text = f"{section} {thing.name!r} cannot name a prim; use letters, digits and _"
-                    yield section, number, "name", text
-                if thing.name.casefold() in taken:
-                    text = f"{section} {thing.name!r} has a name that is taken; give each its own"
-                    yield section, number, "name", text
-                taken.add(thing.name.casefold())
-
     def _misplaced(self, section: str, number: int, opening: Door | Window) -> Iterator[Fault]:
         known = self._known
         if opening.wall not in known:
@@ -382,12 +363,9 @@ class Structure:
             return
         wall, (first, last) = self.wall_of(opening), opening.span_m
         if first < -SAME_M or last > wall.length_m + SAME_M:
-            half = opening.width_m / 2
-            way = (
-                f"choose at_m from {half:g} to {wall.length_m - half:g}"
-                if 2 * half <= wall.length_m
-                else "make it narrower (width_m)"
-            )
+            half, way = opening.width_m / 2, "make it narrower (width_m)"
+            if 2 * half <= wall.length_m:
+                way = f"choose at_m from {half:g} to {wall.length_m - half:g}"
             text = (
                 f"{opening.name!r} reaches from {first:g} to {last:g} m along wall {wall.name!r}, which is "
                 f"{wall.length_m:g} m long; {way}"
@@ -420,16 +398,10 @@ class Structure:
             raise InputError(f"[[{section}]] {number}: {text}")
 
 
-def _hole(wall: Wall, opening: Door | Window) -> list[Vec2]:
-    """Corners of an opening in a wall on the floor."""
-    (first, last), half = opening.span_m, wall.thickness_m / 2
+def corners_of(wall: Wall, span_m: Vec2 | None = None) -> list[Vec2]:
+    """Corners of a wall on the floor, or of a span of it, counter-clockwise."""
+    (first, last), half = span_m or (0.0, wall.length_m), wall.thickness_m / 2
     return [wall.at(s, d) for s, d in ((first, -half), (last, -half), (last, half), (first, half))]
-
-
-def corners_of(wall: Wall) -> list[Vec2]:
-    """Corners of a wall on the floor, counter-clockwise."""
-    half, far = wall.thickness_m / 2, wall.length_m
-    return [wall.at(s, d) for s, d in ((0, -half), (far, -half), (far, half), (0, half))]
 
 
 def overlap_m(one: Sequence[Vec2] | np.ndarray, other: Sequence[Vec2] | np.ndarray) -> float:
@@ -444,8 +416,5 @@ def overlap_m(one: Sequence[Vec2] | np.ndarray, other: Sequence[Vec2] | np.ndarr
 @lru_cache(maxsize=256)
 def steel_of_walls(structure: Structure) -> tuple[SourceSpec, ...]:
     """Sources of all walls and doors of a room."""
-    return tuple(
-        source
-        for wall in (*structure.walls, *structure.sides)
-        for source in sources_of_wall(wall, structure.openings(wall))
-    )
+    walls = (*structure.walls, *structure.sides)
+    return sum((sources_of_wall(wall, structure.openings(wall)) for wall in walls), ())

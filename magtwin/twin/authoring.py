@@ -114,10 +114,8 @@ def scene_from_toml(
         checksum = sha256(where)
     else:
         tables = path.tables
-        where, checksum = (
-            FilePath(f"room {tables['name']!r}"),
-            hashlib.sha256(path.to_toml().encode()).hexdigest(),
-        )
+        where = FilePath(f"room {tables['name']!r}")
+        checksum = hashlib.sha256(path.to_toml().encode()).hexdigest()
     scene = read_toml_scene(
         where,
         table=tables,
@@ -170,9 +168,8 @@ class Authored(_Path):
             return None
         figure = self.plot()
         picture = base64.b64encode(figure._repr_png_()).decode()  # type: ignore[attr-defined]
-        shown = (
-            f'<img alt="the room from above" style="max-width:100%" src="data:image/png;base64,{picture}"/>'
-        )
+        style = 'alt="the room from above" style="max-width:100%"'
+        shown = f'<img {style} src="data:image/png;base64,{picture}"/>'
         return f"{self.scene._repr_html_()}{shown}<p>{escape(str(self))}</p>"
 
 
@@ -208,20 +205,13 @@ def author_scene(
 
     check_free(out, force=force)
     if isinstance(scene, str | FilePath):
+        options: Any = {"map_layer": map_layer, "network": network, "report": report, "progress": progress}
         with tempfile.TemporaryDirectory() as workshop:
-            read = scene_from_toml(
-                scene,
-                map_layer=map_layer,
-                network=network,
-                workshop=workshop,
-                report=report,
-                progress=progress,
-            )
+            read = scene_from_toml(scene, workshop=workshop, **options)
             return Authored(write_scene(read, out, force=force))
     if map_layer is not None or network is not None:
-        raise InputError(
-            "map_layer and network are for a TOML; use with_() on a Scene", parameter="map_layer"
-        )
+        text = "map_layer and network are for a TOML; use with_() on a Scene"
+        raise InputError(text, parameter="map_layer")
     made = importlib.import_module("magtwin.twin.twin").scene_in(scene)
     if hasattr(made, "GetRootLayer"):
         made = importlib.import_module("magtwin").read_scene(made)

@@ -133,7 +133,7 @@ def open_unwritten(
             known[key] = make()
         return known[key]
 
-    def placed(robot: RobotSpec) -> RobotSpec:
+    def placed(k: int, robot: RobotSpec) -> RobotSpec:
         asset = once(robot.asset, lambda: load_robot(robot.asset))
         for part in ("magnetometer", "lidar"):
             name = f"p_base_{part}"
@@ -144,8 +144,7 @@ def open_unwritten(
 
     author = importlib.import_module("magtwin.author.room")  # by name: who opens a stage needs no author
     importlib.import_module("magtwin.author.scene").check_things(scene)
-    others = tuple(dataclasses.replace(other, robot=placed(other.robot)) for other in scene.others)
-    scene = dataclasses.replace(scene, robot=placed(scene.robot), others=others)
+    scene = scene.with_robots(placed)
     checksum = once((scene.map_layer, "sha256"), lambda: layer_sha256(scene.map_layer))
     if scene.map_sha256 not in ("", checksum):
         check_map(scene)
@@ -171,20 +170,10 @@ def _twin_of(
     tracking_error: bool = True,
     again: str = SURVEY_SCENE,
 ) -> Twin:
-    """The twin of an opened scene; as for `open_twin`, what is known of its files, and how to survey
-    it again.
-    """
+    """The twin of an opened scene; `again` is how to survey it again, and others as for `open_twin`."""
     from magtwin.usd.layers import layer_sha256
 
-    read = stage.scene
-    read = dataclasses.replace(
-        read,
-        robot=_with_magnetometer(read.robot, network, magnetometer),
-        others=tuple(
-            dataclasses.replace(other, robot=_with_magnetometer(other.robot, network, magnetometer))
-            for other in read.others
-        ),
-    )
+    read = stage.scene.with_robots(lambda k, robot: _with_magnetometer(robot, network, magnetometer))
     field, predictor = stage.map, _magnetometer(read)
     if stage.stage is not None and "scene_sha256" not in metadata:
         metadata["scene_sha256"] = stage.sha256
@@ -207,10 +196,8 @@ def _twin_of(
     twin = Twin(read, stage.file, field, predictor, obstacles, metadata, platforms, model_error, opened=stage)
     twin = _with_network(twin if tracking_error else without_tracking_error(twin))
     LOG.info("opened %s: map %s, %d obstacles", read.name, field.name, len(obstacles))
-    if predictor and network is not None:
-        named = {**twin.metadata, "network_file": FilePath(network).as_posix()}
-        return dataclasses.replace(twin, metadata=named)
-    return twin
+    named = {"network_file": FilePath(network).as_posix()} if predictor and network is not None else {}
+    return dataclasses.replace(twin, metadata={**twin.metadata, **named})
 
 
 def _stale(stage: "OpenedScene", again: str) -> str:
@@ -343,14 +330,9 @@ def _with_magnetometer(robot: RobotSpec, network: str | FilePath | None, kind: K
     if network is not None:
         if FilePath(network).is_dir():
             raise InputError(f"{network}: a folder; name the weights file in it")
-        physical = str(network) == "none"
-        spec = dataclasses.replace(
-            spec,
-            kind="physical" if physical else "neural",
-            network=None if physical else FilePath(network).resolve(),
-            network_sha256="",
-            inputs=(),
-        )
+        file = None if str(network) == "none" else FilePath(network).resolve()
+        named: Any = {"kind": "physical" if file is None else "neural", "network": file}
+        spec = dataclasses.replace(spec, **named, network_sha256="", inputs=())
     if kind is not None:
         if kind != "neural" and network is not None and str(network) != "none":
             raise InputError(f"a {kind!r} magnetometer has no network; drop `magnetometer` or `network`")
@@ -425,10 +407,9 @@ def twin_of(
     )
     for name, what in _CHECKSUMS.items() if check else ():
         if metadata.get(name, "") != twin.metadata.get(name, ""):
-            raise InputError(
-                f"{scene}: {what} changed since the run: {name} is {twin.metadata.get(name, 'none')}, "
-                f"the run has {metadata.get(name, 'none')}"
-            )
+            now, then = twin.metadata.get(name, "none"), metadata.get(name, "none")
+            text = f"{what} changed since the run: {name} is {now}, the run has {then}"
+            raise InputError(f"{scene}: {text}")
     return twin
 
 

@@ -10,7 +10,6 @@ from magtwin.errors import InputError
 from magtwin.files.file import existing, shipped
 from magtwin.files.kinds import expected
 from magtwin.spec.scene import Scene
-from magtwin.spec.sensors import MagnetometerSpec
 from magtwin.twin.authoring import new_workshop, scene_from_toml
 
 ROOM_RADIUS_M, ROOM_TURN_M = 0.3, 0.28
@@ -53,7 +52,7 @@ def scene_with_robot(
         InputError: The robot cannot be converted or has no wheels, the link is unknown, or as for
             `scene_from_toml`.
     """
-    from magtwin.author.robot import RobotSettings, build_robot
+    from magtwin.author.robot import RobotSettings, build_robot, mounted
     from magtwin.author.scene_file import check_above_floor
     from magtwin.urdf.options import Options
     from magtwin.urdf.report import HUGE_M
@@ -70,15 +69,14 @@ def scene_with_robot(
             arguments=dict(arguments or {}),
             skip_missing_includes=skip_missing_includes,
         )
-        settings = RobotSettings(magnetometer=_mounted(magnetometer), conversion=options)
+        mount = None if magnetometer is None else mounted(magnetometer)
+        settings = RobotSettings(magnetometer=mount, conversion=options)
         asset = FilePath(workshop) / "robot" / f"{stem}.usda"
         asset.parent.mkdir(parents=True, exist_ok=True)
         build_robot(file, settings, asset)
     elif magnetometer or controllers or packages or arguments:
-        raise InputError(
-            f"{file}: an asset has its magnetometer and drive already; give its URDF instead",
-            parameter="robot",
-        )
+        text = "an asset has its magnetometer and drive already; give its URDF instead"
+        raise InputError(f"{file}: {text}", parameter="robot")
     scale, made = 1.0, load_robot(asset)
     if made.footprint_radius_m > HUGE_M / 2:
         raise InputError(
@@ -90,9 +88,8 @@ def scene_with_robot(
         sizes = made.footprint_radius_m / ROOM_RADIUS_M, made.drive.turning_radius_m / ROOM_TURN_M
         scale = max(1.0, *sizes)
         spec, name = shipped("scenes", "starter.toml"), name or stem
-    return _with_path(
-        scene_from_toml(spec, robot=asset, name=name, scale=scale, workshop=workshop, **choices)
-    )
+    scene = scene_from_toml(spec, robot=asset, name=name, scale=scale, workshop=workshop, **choices)
+    return _with_path(scene)
 
 
 def _with_path(scene: Scene) -> Scene:
@@ -102,9 +99,9 @@ def _with_path(scene: Scene) -> Scene:
     from magtwin.path.room import Room, path_in
     from magtwin.sim.motion.plan import plan
 
-    robot, obstacles = scene.robot, obstacles_in(scene.lab, scene.furniture)
     if scene.path:
         return scene
+    robot, obstacles = scene.robot, obstacles_in(scene.lab, scene.furniture)
     room = Room(scene.lab, robot.footprint_radius_m, obstacles)
     for path in PATHS:
         with suppress(InputError):
@@ -113,17 +110,3 @@ def _with_path(scene: Scene) -> Scene:
             plan(way, robot.drive, speed=min(0.2, robot.drive.v_max))
             return replace(scene, path=path)
     return scene
-
-
-def _mounted(text: str | None) -> "MagnetometerSpec | None":
-    """A magnetometer from "LINK" or "LINK:x,y,z"."""
-    if text is None:
-        return None
-    link, _, place = text.partition(":")
-    try:
-        p = tuple(float(part) for part in place.split(",")) if place else (0.0, 0.0, 0.0)
-    except ValueError:
-        p = ()
-    if not link or len(p) != 3:
-        raise InputError(f"magnetometer must be LINK or LINK:X,Y,Z, got {text!r}", parameter="magnetometer")
-    return MagnetometerSpec(link=link, p_link_sensor=p)

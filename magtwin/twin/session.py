@@ -43,14 +43,7 @@ def in_session(twin: Twin, session: Session | None = None, *, seed: int = 0) -> 
     if not isinstance(number, int | np.integer) or isinstance(number, bool) or number < 0:
         raise InputError(f'session must be a whole number from 0 up, or "survey", got {session!r}')
     number, seed = int(number), checked_seed(seed)
-    scene = dataclasses.replace(
-        twin.scene,
-        robot=session_of(twin.scene.robot, seed, number),
-        others=tuple(
-            dataclasses.replace(other, robot=session_of(other.robot, seed, number, which=k))
-            for k, other in enumerate(twin.scene.others, 1)
-        ),
-    )
+    scene = twin.scene.with_robots(lambda k, robot: session_of(robot, seed, number, which=k))
     return dataclasses.replace(twin, scene=scene, session={"session": number, "session_seed": seed})
 
 
@@ -68,21 +61,12 @@ def with_plant(twin: Twin, plant: PlantSpec | str | None) -> Twin:
     if plant is None:
         return twin
     if twin.session:
-        raise InputError(
-            f"the twin is in session {twin.session['session']!r} already; give `plant` before the session",
-            parameter="plant",
-        )
+        text = f"the twin is in session {twin.session['session']!r} already; give `plant` before the session"
+        raise InputError(text, parameter="plant")
     if not isinstance(plant, PlantSpec | str):
         raise InputError(f"plant must be a name or a PlantSpec, got {plant!r}", parameter="plant")
-    scene, text = twin.scene, plant if isinstance(plant, str) else plant_text(plant)
-    robots = [
-        dataclasses.replace(placed.robot, plant=plant_of(text, which=k))
-        for k, placed in enumerate(scene.robots)
-    ]
-    others = tuple(
-        dataclasses.replace(other, robot=robot) for other, robot in zip(scene.others, robots[1:], strict=True)
-    )
-    scene = dataclasses.replace(scene, robot=robots[0], others=others)
+    text = plant if isinstance(plant, str) else plant_text(plant)
+    scene = twin.scene.with_robots(lambda k, robot: dataclasses.replace(robot, plant=plant_of(text, which=k)))
     return dataclasses.replace(twin, scene=scene, metadata={**twin.metadata, "plant": text})
 
 
@@ -112,9 +96,8 @@ def trained_on(twin: Twin) -> bool:
     """Whether the network of a twin was trained on its robot, plant and kind of session."""
     network, robot = twin.magnetometer, twin.scene.robot
     plant = {} if robot.plant == PlantSpec() else {"plant": OF_SCENE}
-    return network is not None and network.knows(
-        {**robot_metadata(robot), **plant, **twin.session, **twin.metadata}
-    )
+    known = {**robot_metadata(robot), **plant, **twin.session, **twin.metadata}
+    return network is not None and network.knows(known)
 
 
 def room_of(twin: Twin) -> Room:

@@ -234,11 +234,9 @@ def check_commands(path: "Path | Commands | Run | str", network: "NeuralMagnetom
         return
     for column in ("v_cmd", "w_cmd"):
         if column in network.columns and column not in path:
-            raise InputError(
-                f"the run to replay has no column {column!r}, which the network {network.name} reads; take a "
-                'network that does not, such as the paper\'s, or `network="none"`',
-                parameter="network",
-            )
+            what = f"the run to replay has no column {column!r}, which the network {network.name} reads"
+            way = 'take a network that does not, such as the paper\'s, or `network="none"`'
+            raise InputError(f"{what}; {way}", parameter="network")
 
 
 def reader(twin: Twin, seed: int, *, which: int = 0) -> "Callable[[Sensed], tuple[Run, Read | None]]":

@@ -51,11 +51,8 @@ MOST_RUNS = 1_000_000
 def check_count(count: int) -> None:
     """Refuse more runs than one sweep makes."""
     if count > MOST_RUNS:
-        raise InputError(
-            f"{count:,} runs are too many for one sweep (at most {MOST_RUNS:,}); make several, each with "
-            "another `seed`",
-            parameter="count",
-        )
+        text = f"{count:,} runs are too many for one sweep (at most {MOST_RUNS:,})"
+        raise InputError(f"{text}; make several, each with another `seed`", parameter="count")
 
 
 def sweep(
@@ -248,9 +245,8 @@ class _Finish:
         rows = [each.run for each in sensed]
         twins = [known[id(job.scene)][0] for job in jobs]
         reads: list[Read | None] = [None] * len(rows)
-        for predictor in {
-            id(own.magnetometer): own.magnetometer for own in twins if own.magnetometer
-        }.values():
+        predictors = {id(own.magnetometer): own.magnetometer for own in twins if own.magnetometer}
+        for predictor in predictors.values():
             those = [n for n, own in enumerate(twins) if own.magnetometer is predictor]
             options: Any = {"outside": flagged, "known": [trained_on(twins[n]) for n in those]}
             for n, made in zip(those, predictor.read([rows[n] for n in those], **options), strict=True):
@@ -258,9 +254,8 @@ class _Finish:
         runs = []
         for job, each, read in zip(jobs, sensed, reads, strict=True):
             own, config = known[id(job.scene)]
-            run = each.read(
-                (read.disturbance_nt, read.sd_nt) if read else None, model_error_of(own, job.seed)
-            )
+            predicted = (read.disturbance_nt, read.sd_nt) if read else None
+            run = each.read(predicted, model_error_of(own, job.seed))
             if check:
                 self.check(job, run)
             options = {"duration_s": self.duration_s, "config_sha256": config}
@@ -305,10 +300,8 @@ def _twins(
 
     if robots is not None:
         given = _each("robots", robots, count)
-        return [
-            once((id(base), id(robot)), partial(_with_robot, base, robot, model_error))
-            for base, robot in zip(bases, given, strict=True)
-        ]
+        both = zip(bases, given, strict=True)
+        return [once((id(b), id(r)), partial(_with_robot, b, r, model_error)) for b, r in both]
     if sessions is None:
         pairs = zip(bases, seeds, strict=True)
         return [once((id(base), k), partial(in_session, base, seed=k)) for base, k in pairs]

@@ -17,7 +17,7 @@ from magtwin.report.summary import Summarized, Summary
 from magtwin.spec.base import spelled
 from magtwin.spec.obstacles import Obstacles
 from magtwin.spec.plant import PlantSpec
-from magtwin.spec.robot import RobotSpec
+from magtwin.spec.robot import PlacedRobot, RobotSpec, fields_of
 from magtwin.spec.scene import Scene
 from magtwin.spec.sensors import MagnetometerSpec
 
@@ -110,9 +110,6 @@ class Twin(Summarized):
     def __getstate__(self) -> dict[str, object]:
         return {**self.__dict__, "opened": None}  # an open stage stays in its process
 
-    def __setstate__(self, state: dict[str, object]) -> None:
-        self.__dict__.update(state)
-
     def _summary(self) -> Summary:
         """The scene and its file, the robot, the map and the network."""
         robot, field = self.scene.robot, self.field._summary()
@@ -121,15 +118,14 @@ class Twin(Summarized):
         sensor += f", plant {plant}" if plant else ""
         more = f", and {len(self.scene.others)} more robots" if self.scene.others else ""
         network = self.magnetometer._summary().title.partition(" ")[2] if self.magnetometer else "none"
-        return Summary(
-            f"Twin {self.scene.name}: floor {self.scene.lab.size_text}, {len(self.obstacles)} obstacles",
-            (
-                ("robot", sensor + more + (f", session {self.session['session']}" if self.session else "")),
-                ("map", field.title.partition(" ")[2]),
-                ("network", network),
-                ("file", str(self.scene_file) if self.stage is None else "none: opened from a Scene"),
-            ),
-        )
+        rows = {
+            "robot": sensor + more + (f", session {self.session['session']}" if self.session else ""),
+            "map": field.title.partition(" ")[2],
+            "network": network,
+            "file": str(self.scene_file) if self.stage is None else "none: opened from a Scene",
+        }
+        title = f"Twin {self.scene.name}: floor {self.scene.lab.size_text}, {len(self.obstacles)} obstacles"
+        return Summary(title, tuple(rows.items()))
 
 
 def scene_in(place: Any, what: str = "scene must be") -> Any:
@@ -171,16 +167,12 @@ def opened(
 def without_tracking_error(twin: Twin) -> Twin:
     """The twin whose controllers get exact poses."""
 
-    def changed(robot: RobotSpec) -> RobotSpec:
-        drive = dataclasses.replace(
-            robot.drive, localization_std_m=0.0, localization_yaw_std=0.0, localization_latency_s=0.0
-        )
-        return dataclasses.replace(robot, drive=drive)
+    def changed(k: int, robot: RobotSpec) -> RobotSpec:
+        exact = {"localization_std_m": 0.0, "localization_yaw_std": 0.0, "localization_latency_s": 0.0}
+        return dataclasses.replace(robot, drive=dataclasses.replace(robot.drive, **exact))  # type: ignore[arg-type]
 
-    scene = twin.scene
-    others = tuple(dataclasses.replace(other, robot=changed(other.robot)) for other in scene.others)
-    scene = dataclasses.replace(scene, robot=changed(scene.robot), others=others)
-    return dataclasses.replace(twin, scene=scene, metadata={**twin.metadata, "tracking_error": False})
+    metadata = {**twin.metadata, "tracking_error": False}
+    return dataclasses.replace(twin, scene=twin.scene.with_robots(changed), metadata=metadata)
 
 
 def without_model_error(twin: Twin) -> Twin:
@@ -203,17 +195,12 @@ def checked_seed(seed: object) -> int:
 def scene_sha256(scene: Scene) -> str:
     """Checksum of every value of a scene in its session, without its files, which have checksums."""
 
-    def bare(robot: RobotSpec) -> RobotSpec:
-        sensor = dataclasses.replace(robot.magnetometer, network=None, network_sha256="", inputs=())
-        return dataclasses.replace(robot, asset=FilePath(), magnetometer=sensor)
+    def bare(k: int, placed: PlacedRobot) -> PlacedRobot:
+        sensor = MagnetometerSpec() if k else placed.robot.magnetometer  # those of others change nothing here
+        sensor = dataclasses.replace(sensor, network=None, network_sha256="", inputs=())
+        robot = dataclasses.replace(placed.robot, asset=FilePath(), magnetometer=sensor)
+        return dataclasses.replace(placed, robot=robot, path="")
 
-    others = tuple(  # the sensors of other robots do not change this run
-        dataclasses.replace(
-            other, robot=bare(dataclasses.replace(other.robot, magnetometer=MagnetometerSpec())), path=""
-        )
-        for other in scene.others
-    )
-    scene = dataclasses.replace(
-        scene, map_layer=FilePath(), map_sha256="", robot=bare(scene.robot), path="", others=others
-    )
+    robots = fields_of([bare(k, placed) for k, placed in enumerate(scene.robots)])
+    scene = dataclasses.replace(scene, map_layer=FilePath(), map_sha256="", **robots)
     return hashlib.sha256(spelled(scene).encode()).hexdigest()

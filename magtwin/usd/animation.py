@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 
-from magtwin.errors import InputError, find
+from magtwin.errors import InputError, about, find
 from magtwin.files.outputs import output
 from magtwin.frames import quat_conjugate, quat_multiply, rotate
 from magtwin.run import mapped
@@ -232,10 +232,8 @@ def _read(layer: Sdf.Layer, path: str | os.PathLike[str]) -> Run:
             unit, frame = said.get("unit", ""), said.get("frame", "")
             specs[name] = Column(unit, frame, attribute.documentation, len(parts) or 1, parts, rule)
     metadata = json.loads(layer.customLayerData.get(_FACTS, "{}"))
-    try:
+    with about(f"{path}: holds a damaged run:"):
         return Run(columns, {k: v for k, v in metadata.items() if isinstance(v, str | int | float)}, specs)
-    except InputError as error:
-        raise InputError(f"{path}: holds a damaged run: {error}") from error
 
 
 def _run_path(layer: Sdf.Layer) -> Sdf.Path:
@@ -263,9 +261,8 @@ def _stand(stage: Usd.Stage, default: Usd.Prim, name: str) -> _Stand:
     if not default:
         raise InputError(f"{place(prim)}: the stage has no default prim, which holds the run; set one")
     if prim.IsInstance() or prim.IsInstanceProxy():
-        raise InputError(
-            f"{place(prim)}: the robot is an instance, whose wheels cannot turn; make it not instanceable"
-        )
+        text = "the robot is an instance, whose wheels cannot turn; make it not instanceable"
+        raise InputError(f"{place(prim)}: {text}")
     cache = UsdGeom.XformCache()
     if cache.GetParentToWorldTransform(prim) != Gf.Matrix4d(1):
         raise InputError(
@@ -349,10 +346,8 @@ def _samples(
         wanted = [name for name in dict.fromkeys((*pose, "wheel_angle", *kept)) if name in run]
         rules: Any = {pose[0]: "linear", pose[1]: "quaternion"}  # it moves between recorded poses
         at = grid(run["t"][0], run["t"][-1], fps)
-        frames, at_frames = (
-            run.select(*wanted).resample(at, interpolation=rules),
-            np.arange(len(at), dtype=float),
-        )
+        frames = run.select(*wanted).resample(at, interpolation=rules)
+        at_frames = np.arange(len(at), dtype=float)
     codes = at_frames.tolist()
     p, q = (frames[name] for name in pose)
     known = np.isfinite(p).all(axis=1) & np.isfinite(q).all(axis=1)

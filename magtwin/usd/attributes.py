@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, about
 from magtwin.frames import wxyz_from_xyzw, xyzw_from_wxyz
 from magtwin.spec.base import Quat, Vec3
 from magtwin.usd.layers import relative_asset
@@ -47,10 +47,8 @@ def read_spec(cls: type[S], prim: Usd.Prim, noun: str, **known: Any) -> S:
     for field in fields(cls):  # type: ignore[arg-type]
         if field.name not in known:
             values[field.name] = plain_value(prim.GetAttribute(attribute_name(noun, field.name)))
-    try:
+    with about(f"{place(prim)}:"):
         return cls(**values)
-    except InputError as error:
-        raise InputError(f"{place(prim)}: {error}") from error
 
 
 def read_axis(prim: Usd.Prim, name: str = "axis") -> str:
@@ -152,9 +150,8 @@ def check_prim_name(name: str, what: str) -> str:
         InputError: It has characters other than letters, digits and _, or starts with a digit.
     """
     if not Sdf.Path.IsValidIdentifier(name):
-        raise InputError(
-            f"{what} {name!r} cannot name a prim; use letters, digits and _, not starting with a digit"
-        )
+        way = "use letters, digits and _, not starting with a digit"
+        raise InputError(f"{what} {name!r} cannot name a prim; {way}")
     return name
 
 
@@ -188,10 +185,8 @@ def _value(attribute: Usd.Attribute) -> Any:
     """As `plain_value`, of a stage that is being written."""
     value, kind = value_of(attribute), type_of(attribute)
     if not isinstance(value, kind.type.pythonClass or type(kind.defaultValue)):
-        raise InputError(
-            f"{place(attribute.GetPrim())}: {attribute.GetName()} must be a {kind}, "
-            f"got a {type(value).__name__}"
-        )
+        text = f"{attribute.GetName()} must be a {kind}, got a {type(value).__name__}"
+        raise InputError(f"{place(attribute.GetPrim())}: {text}")
     if isinstance(value, Sdf.AssetPath):  # the file need not exist
         if not value.path:
             return None

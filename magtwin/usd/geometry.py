@@ -159,10 +159,7 @@ def read_shapes(stage: Usd.Stage | str | os.PathLike[str], *, purposes: Sequence
     """
     stage = stage if isinstance(stage, Usd.Stage) else open_stage(stage)
     _check_amount(stage)
-    shapes: list[Shape] = []
-    for gprim, solid, to_frame, name in _shown(stage, purposes):
-        shapes += _shapes(gprim, solid, to_frame, name)
-    return shapes
+    return [shape for shown in _shown(stage, purposes) for shape in _shapes(*shown)]
 
 
 def read_vertices(
@@ -226,7 +223,8 @@ def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
     """
     stage = stage if isinstance(stage, Usd.Stage) else open_stage(stage)
     cache, bodies = UsdGeom.XformCache(), _bodies(stage)
-    world = {path: _rigid(cache.GetLocalToWorldTransform(stage.GetPrimAtPath(path))) for path in bodies}
+    whole = {path: cache.GetLocalToWorldTransform(stage.GetPrimAtPath(path)) for path in bodies}
+    world = {path: matrix.RemoveScaleShear() for path, matrix in whole.items()}
     above = {child: (joint, parent) for joint, parent, child in _joints(stage, bodies)}
     roots = _roots(bodies, above)
     named = {roots[path]: path for path in bodies if path.name == BASE_LINK}
@@ -252,20 +250,18 @@ def read_links(stage: Usd.Stage | str | os.PathLike[str]) -> dict[str, Link]:
 def read_colour_scale(stage: Usd.Stage) -> ColourScale | None:
     """The scale of the first visible heat map of a stage; None if there is none."""
     for prim in _prims(stage):
-        metadata = prim.GetCustomDataByKey("magtwin")
-        if not isinstance(metadata, dict) or "colourMap" not in metadata:
+        data = prim.GetCustomDataByKey("magtwin")
+        shown = isinstance(data, dict) and "colourMap" in data
+        if not shown or UsdGeom.Imageable(prim).ComputeVisibility() == "invisible":
             continue
-        if UsdGeom.Imageable(prim).ComputeVisibility() != "invisible":
-            name, unit = metadata["colourMap"], metadata.get("unit")
-            least, greatest = metadata.get("least"), metadata.get("greatest")
-            texts = isinstance(name, str) and isinstance(unit, str)
-            numbers = [x for x in (least, greatest) if isinstance(x, int | float) and np.isfinite(x)]
-            if not texts or len(numbers) < 2:
-                raise InputError(
-                    f"{place(prim)}: the colour scale in its customData wants colourMap and unit as texts, "
-                    "least and greatest as numbers; correct it"
-                )
-            return ColourScale(str(name), numbers[0], numbers[1], str(unit), str(prim.GetPath()))
+        texts = [x for x in map(data.get, ("colourMap", "unit")) if isinstance(x, str)]
+        numbers = [x for x in map(data.get, ("least", "greatest")) if isinstance(x, int | float)]
+        if len(texts) < 2 or len(numbers) < 2 or not np.isfinite(numbers).all():
+            raise InputError(
+                f"{place(prim)}: the colour scale in its customData wants colourMap and unit as texts, "
+                "least and greatest as numbers; correct it"
+            )
+        return ColourScale(texts[0], numbers[0], numbers[1], texts[1], str(prim.GetPath()))
     return None
 
 
@@ -337,19 +333,17 @@ def _shown(
             continue
         to_frame = cache.GetLocalToWorldTransform(prim)
         if body is not None:
-            to_frame = to_frame * _rigid(cache.GetLocalToWorldTransform(body)).GetInverse()
+            to_frame *= cache.GetLocalToWorldTransform(body).RemoveScaleShear().GetInverse()
         yield gprim, solid, np.array(to_frame), "" if body is None else bodies[body.GetPath()]
 
 
 def _bodies(stage: Usd.Stage) -> dict:
     """Unique names of the rigid bodies by path."""
     names: dict = {}
-    taken = set()
     for prim in _prims(stage):
         if prim.HasAPI(UsdPhysics.RigidBodyAPI):
-            name = str(prim.GetPath()) if prim.GetName() in taken else prim.GetName()
-            names[prim.GetPath()] = name
-            taken.add(name)
+            taken = prim.GetName() in names.values()
+            names[prim.GetPath()] = str(prim.GetPath()) if taken else prim.GetName()
     return names
 
 
@@ -391,11 +385,6 @@ def axis_of(joint: UsdPhysics.Joint) -> Vec3 | None:
     turned = Gf.Rotation(joint.GetLocalRot1Attr().Get()).TransformDir(axis)
     x, y, z = (round(float(c), 9) + 0.0 for c in turned)
     return (x, y, z)
-
-
-def _rigid(matrix: Gf.Matrix4d) -> Gf.Matrix4d:
-    """A transform without its scale and shear: a frame."""
-    return matrix.RemoveScaleShear()
 
 
 def _pose(matrix: Gf.Matrix4d) -> tuple[Vec3, Quat]:
@@ -461,10 +450,15 @@ def _placed(gprim: UsdGeom.Gprim, solid: Solid, to_frame: NDArray) -> NDArray[np
     return points
 
 
+def _surface(prim: Usd.Prim) -> UsdShade.Shader | None:
+    """The surface shader of the bound material."""
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+    return material.ComputeSurfaceSource()[0] if material else None
+
+
 def _material_colour(prim: Usd.Prim) -> tuple[float, float, float, float] | None:
     """Colour and opacity of the bound UsdPreviewSurface; None if a primvar gives its colour."""
-    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
-    surface = material.ComputeSurfaceSource()[0] if material else None
+    surface = _surface(prim)
     if not surface or surface.GetIdAttr().Get() != "UsdPreviewSurface":
         return None
     diffuse, opacity = surface.GetInput("diffuseColor"), surface.GetInput("opacity")
@@ -481,8 +475,7 @@ def _material_colour(prim: Usd.Prim) -> tuple[float, float, float, float] | None
 def _texture(prim: Usd.Prim, gprim: UsdGeom.Gprim, triangles: NDArray, mirrored: bool) -> Texture | None:
     """The texture of the bound material's colour, on triangles of face-vertex indices, shape (F, 3)."""
     triangles = triangles[:, ::-1] if mirrored else triangles
-    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
-    surface = material.ComputeSurfaceSource()[0] if material else None
+    surface = _surface(prim)
     shader, channel = _source(surface, "diffuseColor")
     reader, _ = _source(shader, "st")
     if channel != "rgb" or shader is None or reader is None or shader.GetIdAttr().Get() != "UsdUVTexture":

@@ -24,9 +24,8 @@ def info_of_stage(path: Path) -> Report:
     prims = list(stage.TraverseAll())
     bodies = [p for p in prims if p.HasAPI(UsdPhysics.RigidBodyAPI)]
     joints = Counter(p.GetTypeName().removeprefix("Physics") for p in prims if p.IsA(UsdPhysics.Joint))
-    mass = sum(
-        UsdPhysics.MassAPI(p).GetMassAttr().Get() or 0.0 for p in bodies if p.HasAPI(UsdPhysics.MassAPI)
-    )
+    weighed = [UsdPhysics.MassAPI(p) for p in bodies if p.HasAPI(UsdPhysics.MassAPI)]
+    mass = sum(body.GetMassAttr().Get() or 0.0 for body in weighed)
     purposes = [UsdGeom.Tokens.default_, UsdGeom.Tokens.render]
     box = UsdGeom.BBoxCache(Usd.TimeCode.Default(), purposes).ComputeWorldBound(stage.GetPseudoRoot())
     bounds = box.ComputeAlignedRange()
@@ -43,20 +42,13 @@ def info_of_stage(path: Path) -> Report:
         Figure("joints", sum(joints.values()), note=", ".join(f"{n} {t}" for t, n in sorted(joints.items()))),
         Figure("mass", float(mass) * kilograms, "kg"),
     ]
-    applied = [
-        (schema, prim)
-        for prim in prims
-        for schema in prim.GetPrimTypeInfo().GetAppliedAPISchemas()
-        if schema.startswith(_PREFIX)
-    ]
     places: dict[str, list[str]] = {}
-    for schema, prim in applied:
-        if schema not in _MANY:
-            places.setdefault(schema, []).append(str(prim.GetPath()))
-    figures += [Figure(schema, ", ".join(paths)) for schema, paths in places.items()]
-    for many in _MANY:
-        if count := sum(schema == many for schema, _ in applied):
-            figures.append(Figure(many, count, "prims"))
+    for prim in prims:
+        for schema in prim.GetPrimTypeInfo().GetAppliedAPISchemas():
+            if schema.startswith(_PREFIX):
+                places.setdefault(schema, []).append(str(prim.GetPath()))
+    figures += [Figure(name, ", ".join(paths)) for name, paths in places.items() if name not in _MANY]
+    figures += [Figure(name, len(places[name]), "prims") for name in _MANY if name in places]
     figures += _labs(path, stage)
     return Report(str(path), tuple(figures))
 

@@ -84,10 +84,8 @@ def open_stage(path: str | os.PathLike[str], *, own: bool = False) -> Usd.Stage:
     with translated(path, "cannot be opened as USD"):
         stage = Usd.Stage.Open(str(path))
         if unsaved := [x.identifier for x in stage.GetUsedLayers() if x.realPath and x.dirty]:
-            raise InputError(
-                f"{path}: {unsaved[0]} has changes in this process that are not saved; save them "
-                "(`stage.Save()`), or drop them (`layer.Reload()`)"
-            )
+            way = "save them (`stage.Save()`), or drop them (`layer.Reload()`)"
+            raise InputError(f"{path}: {unsaved[0]} has changes in this process that are not saved; {way}")
         stage.Reload()  # a layer that is still held elsewhere would be stale
         errors = stage.GetCompositionErrors()
     if errors:
@@ -226,8 +224,9 @@ def save_layer(layer: Sdf.Layer, sublayers: Mapping[str, str] = MappingProxyType
     copy = Sdf.Layer.CreateAnonymous(path.name)
     copy.TransferContent(layer)
     copy.subLayerPaths = [sublayers.get(name, name) for name in layer.subLayerPaths]
+    kind = "usdc" if _is_crate(path) else "usda"
     with output(path, force=True, in_place=True) as aside:
-        export_like(copy, path, aside)
+        copy.Export(str(aside), args={"format": kind} if path.suffix.lower() == ".usd" else {})
     afterwards(functools.partial(layer.Reload, force=True))
 
 
@@ -240,12 +239,6 @@ def check_not_part(stage: Usd.Stage, out: str | os.PathLike[str]) -> None:
     file = Path(os.path.realpath(out))
     if any(file == Path(layer.realPath).resolve() for layer in stage.GetUsedLayers() if layer.realPath):
         raise InputError(f"{out}: is a part of the scene; give another name")
-
-
-def export_like(layer: Sdf.Layer, path: Path, out: Path) -> None:
-    """Write a layer to another file, as text or crate as the file `path` is."""
-    kind = "usdc" if _is_crate(path) else "usda"
-    layer.Export(str(out), args={"format": kind} if path.suffix.lower() == ".usd" else {})
 
 
 def layer_files(path: str | os.PathLike[str]) -> list[Path]:

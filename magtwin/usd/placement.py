@@ -17,14 +17,13 @@ from pxr import Gf, Sdf, Usd, UsdGeom
 from magtwin.errors import InputError
 from magtwin.usd.schema import has_api, only_prim_with, place, prims_with
 from magtwin.usd.sensors import MAP_RELATIONSHIP
+from magtwin.usd.units import said
 
 SAME = 1e-6
 """Largest relative error of a length that counts as none."""
 
 UPRIGHT = 1 - 1e-9
 """Cosine of the tilt of a lab that counts as level: 0.003 deg."""
-
-UNITS = "{:g} m a unit and {} up"
 
 _PLACED = "xformOp:transform:magtwinLab"
 
@@ -119,18 +118,15 @@ def pose_of(lab: Lab) -> Pose:
     stage = lab.root.GetStage()
     metres = UsdGeom.GetStageMetersPerUnit(stage)
     if not 0 < metres < math.inf:
-        raise InputError(
-            f"{stage.GetRootLayer().identifier}: its metersPerUnit is {metres:g}; set it to 1, and make the "
-            "stage in metres"
-        )
-    up = _up(stage)
+        text = f"its metersPerUnit is {metres:g}; set it to 1, and make the stage in metres"
+        raise InputError(f"{stage.GetRootLayer().identifier}: {text}")
+    level = _level(stage)
     world = _world(lab.root)
     rows = np.array(world)[:3, :3] * metres
     lengths = np.linalg.norm(rows, axis=1)
     right = np.abs(lengths - 1).max() <= SAME and np.abs(rows @ rows.T - np.eye(3)).max() <= SAME
-    if not (right and np.linalg.det(rows) > 0 and rows[2] @ up >= UPRIGHT):
+    if not (right and np.linalg.det(rows) > 0 and rows[2] @ level[:, 2] >= UPRIGHT):
         raise _refused(lab, metres)
-    level = np.array(_level(stage))  # takes the stage's axes to Z up
     p = np.array(world.ExtractTranslation()) * metres @ level
     ahead = rows[0] @ level
     return Pose((float(p[0]), float(p[1]), float(p[2])), float(math.atan2(ahead[1], ahead[0])))
@@ -158,15 +154,12 @@ def take_to_origin(stage: Usd.Stage, lab: Lab) -> None:
         for prim in gone:
             prim.SetActive(False)
     root, world = lab.root, _world(lab.root)
-    level = UsdGeom.LinearUnitsAre(UsdGeom.GetStageMetersPerUnit(stage), 1) and _up(stage)[2] == 1
+    level = UsdGeom.LinearUnitsAre(UsdGeom.GetStageMetersPerUnit(stage), 1) and _level(stage)[2, 2] == 1
     if level and world == Gf.Matrix4d(1):
         return
     inverse = world.GetInverse()
-    outside = [
-        (prim, UsdGeom.Xformable(prim).GetLocalTransformation() * inverse)
-        for prim in _movable(stage.GetPseudoRoot())
-        if prim != root
-    ]
+    movable = [prim for prim in _movable(stage.GetPseudoRoot()) if prim != root]
+    outside = [(prim, UsdGeom.Xformable(prim).GetLocalTransformation() * inverse) for prim in movable]
     with session:
         UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.meters)
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
@@ -182,11 +175,6 @@ def take_to_origin(stage: Usd.Stage, lab: Lab) -> None:
 
 def _world(prim: Usd.Prim) -> Gf.Matrix4d:
     return UsdGeom.XformCache().GetLocalToWorldTransform(prim)
-
-
-def _up(stage: Usd.Stage) -> np.ndarray:
-    """The stage's up axis."""
-    return np.array([0.0, 0.0, 1.0] if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else [0.0, 1.0, 0.0])
 
 
 def _level(stage: Usd.Stage) -> np.ndarray:
@@ -208,12 +196,8 @@ def _open_instances(stage: Usd.Stage) -> None:
     """Make instances that hold a lab, a map or a robot ordinary prims, in the session layer."""
     wanted = ("lab", "anomalyMap", "robot", "magnetometer")
     while stage.GetPrototypes():
-        inside = (
-            prim
-            for prim in stage.Traverse(Usd.TraverseInstanceProxies())
-            if prim.IsInstanceProxy() and any(has_api(prim, noun) for noun in wanted)
-        )
-        prim = next(inside, None)
+        proxies = (p for p in stage.Traverse(Usd.TraverseInstanceProxies()) if p.IsInstanceProxy())
+        prim = next((p for p in proxies if any(has_api(p, noun) for noun in wanted)), None)
         if prim is None:
             return
         while prim.IsInstanceProxy():
@@ -240,11 +224,8 @@ def _of_others(stage: Usd.Stage, lab: Lab, others: list[Lab]) -> Iterator[Usd.Pr
         path = robot.GetPath()
         if path.HasPrefix(ours) or any(path.HasPrefix(root) for root in whole):
             continue
-        maps = [
-            t
-            for m in prims_with(robot, "magnetometer")
-            for t in m.GetRelationship(MAP_RELATIONSHIP).GetForwardedTargets()
-        ]
+        named = [m.GetRelationship(MAP_RELATIONSHIP) for m in prims_with(robot, "magnetometer")]
+        maps = [target for relationship in named for target in relationship.GetForwardedTargets()]
         if any(_belongs(target, root, [ours, *theirs]) for target in maps for root in theirs):
             yield robot
 
@@ -296,9 +277,10 @@ def _other_lab(lab: Lab, prim: Usd.Prim) -> bool:
 def _refused(lab: Lab, metres: float) -> InputError:
     """The error of a lab that does not stand level in its own size."""
     stage = lab.root.GetStage()
-    if not (UsdGeom.LinearUnitsAre(metres, UsdGeom.LinearUnits.meters) and _up(stage)[2] == 1):
-        units = UNITS.format(metres, UsdGeom.GetStageUpAxis(stage))
-        turn = "" if _up(stage)[2] == 1 else " and rotateX -90"
+    z_up = _level(stage)[2, 2] == 1
+    if not (UsdGeom.LinearUnitsAre(metres, UsdGeom.LinearUnits.meters) and z_up):
+        units = said((metres, UsdGeom.GetStageUpAxis(stage)))
+        turn = "" if z_up else " and rotateX -90"
         return InputError(
             f"{place(lab.root)}: the stage has {units}; magtwin reads metres with Z up, and USD converts "
             f"neither: reference the lab with scale {1 / metres:g}{turn}, or make the stage in metres, Z up"
@@ -323,6 +305,5 @@ def _refused(lab: Lab, metres: float) -> InputError:
                 f"{place(prim)}: is {what}, and its lab with it; a lab can be moved and turned about the "
                 "vertical, but neither tilted nor scaled"
             )
-    return InputError(
-        f"{place(lab.root)}: is tilted or scaled; a lab can be moved and turned about the vertical"
-    )
+    text = "is tilted or scaled; a lab can be moved and turned about the vertical"
+    return InputError(f"{place(lab.root)}: {text}")

@@ -7,7 +7,7 @@ from typing import Any
 
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, about
 from magtwin.files.file import existing, sha256
 from magtwin.frames import IDENTITY_XYZW, canonical, xyzw_from_wxyz
 from magtwin.spec.base import Quat, Vec3
@@ -16,6 +16,7 @@ from magtwin.usd.geometry import BASE_LINK
 from magtwin.usd.layers import open_stage, translates
 from magtwin.usd.schema import only_prim_with, place
 from magtwin.usd.sensors import (
+    ON_ROOT,
     joints_of,
     read_battery,
     read_drive,
@@ -23,9 +24,7 @@ from magtwin.usd.sensors import (
     read_imu,
     read_lidar,
     read_magnetometer,
-    read_mocap,
-    read_plant,
-    read_platform,
+    read_on_root,
 )
 
 PARALLEL = 1e-12
@@ -68,14 +67,12 @@ def read_robot(prim: Usd.Prim, asset: Path | None = None) -> RobotSpec:
     parts: dict[str, Any] = {
         "drive": read_drive(prim),
         "battery": read_battery(only_prim_with(prim, "battery")),
-        "platform": read_platform(prim),
         "magnetometer": read_magnetometer(magnetometer),
         "imu": read_imu(imu),
         "lidar": read_lidar(lidar),
-        "mocap": read_mocap(prim),
-        "plant": read_plant(prim),
+        **{noun: read_on_root(prim, noun) for noun in ON_ROOT},
     }
-    try:
+    with about(f"{place(prim)}:"):
         return RobotSpec(
             name=prim.GetName(),
             asset=asset,
@@ -88,8 +85,6 @@ def read_robot(prim: Usd.Prim, asset: Path | None = None) -> RobotSpec:
             q_base_lidar_link_xyzw=_q_base(prim, lidar.GetParent()),
             **parts,
         )
-    except InputError as error:
-        raise InputError(f"{place(prim)}: {error}") from error
 
 
 def read_notes(asset: str | os.PathLike[str]) -> tuple[str, ...]:

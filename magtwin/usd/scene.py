@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, about
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.scene_state import changes_since
 from magtwin.files.outputs import transaction
 from magtwin.frames import yaw_from_quat
 from magtwin.spec.magnetics import EarthFieldSpec
 from magtwin.spec.obstacles import Obstacles
-from magtwin.spec.robot import PlacedRobot
+from magtwin.spec.robot import PlacedRobot, fields_of
 from magtwin.spec.scene import Scene
 from magtwin.usd.attributes import plain_value, read_pose, target
 from magtwin.usd.geometry import Link, Shape, read_links, read_shapes
@@ -170,10 +170,8 @@ def open_scene(
     else:
         path = Path(path)
         if path.suffix.lower() == ".usdz":
-            raise InputError(
-                f"{path}: files inside a package cannot be read; unpack it with `magtwin export "
-                f"{quote(str(path))} --out DIR` and give the layer in DIR"
-            )
+            way = f"unpack it with `magtwin export {quote(str(path))} --out DIR` and give the layer in DIR"
+            raise InputError(f"{path}: files inside a package cannot be read; {way}")
         stage = open_stage(path)
     where = lab_on(stage, lab)
     several, pose = len(labs_on(stage)) > 1, pose_of(where)
@@ -198,22 +196,17 @@ def open_scene(
                 "a scene share one"
             )
     sources, furniture = read_magnets(stage)
-    try:
+    with about(f"{place(prims[0])}:"):
         scene = Scene(
             name=path.stem,
             map_layer=layer.resolve(),
             map_sha256=checksum,
-            robot=robots[0].robot,
             lab=read_lab(only_prim_with(stage.GetPseudoRoot(), "lab")),
             earth=earth,
             sources=sources,
             furniture=furniture,
-            start=robots[0].start,
-            path=robots[0].path,
-            others=tuple(robots[1:]),
+            **fields_of(robots),
         )
-    except InputError as error:
-        raise InputError(f"{place(prims[0])}: {error}") from error
     if scene.map_layer != path.resolve():  # a flattened stage is its own map, and has no checksum
         check_map(scene, f"{place(magnetometers[0])}: ")
     made = anomaly_map.made_from
@@ -294,14 +287,14 @@ def earth_in(stage: Usd.Stage, lab: Lab) -> tuple[EarthFieldSpec | None, list[st
     The lab's own field turns with the lab: the map was measured with it. Without one, the field of the stage
     is turned into the lab's axes.
     """
-    found = [(prim, _turned(read_earth(prim), into_lab(lab, prim))) for prim in _all_with(stage, "earth")]
+    prims = [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if has_api(prim, "earth")]
+    found = [(prim, _turned(read_earth(prim), into_lab(lab, prim))) for prim in prims]
     own = [(p, e) for p, e in found if nearest_lab(p, labs_on(stage)) == lab]
     free = [(p, e) for p, e in found if nearest_lab(p, labs_on(stage)) is None]
     for those in (own, [] if own else free):
         if len(those) > 1:
-            raise InputError(
-                f"{place(those[1][0])}: a second Earth's field; the first is {those[0][0].GetPath()}"
-            )
+            first = those[0][0].GetPath()
+            raise InputError(f"{place(those[1][0])}: a second Earth's field; the first is {first}")
     if not (own or free):
         return None, []
     chosen, earth = (own or free)[0]
@@ -325,10 +318,6 @@ def _turned(earth: EarthFieldSpec, matrix: Gf.Matrix4d) -> EarthFieldSpec:
     north = turn.TransformDir(Gf.Vec3d(0, 1, 0))
     yaw = math.degrees(math.atan2(-north[0], north[1]))
     return replace(earth, b_world_nt=(x, y, z), north_deg=math.remainder(earth.north_deg + yaw, 360))
-
-
-def _all_with(stage: Usd.Stage, noun: str) -> list[Usd.Prim]:
-    return [p for p in stage.Traverse(Usd.TraverseInstanceProxies()) if has_api(p, noun)]
 
 
 def map_of(magnetometer: Usd.Prim) -> Usd.Prim:
@@ -400,17 +389,13 @@ def use_map(
         if Path(layer.ComputeAbsolutePath(name)).resolve() == old
     ]
     if not held:
-        raise InputError(
-            f"{opened.file}: the map {old} is no sublayer of this stage, so it cannot be replaced here; "
-            "survey the stage that has it as a sublayer",
-            parameter="adopt",
-        )
+        text = f"the map {old} is no sublayer of this stage, so it cannot be replaced here"
+        way = "survey the stage that has it as a sublayer"
+        raise InputError(f"{opened.file}: {text}; {way}", parameter="adopt")
     if not any(map_layer.resolve().is_relative_to(folder) for folder in folders_of(opened.file)):
-        raise InputError(
-            f"{map_layer}: is not in the folder of {opened.file}, so the stage may not name it; write the "
-            f"map into {opened.file.resolve().parent}",
-            parameter="adopt",
-        )
+        text = f"is not in the folder of {opened.file}, so the stage may not name it"
+        way = f"write the map into {opened.file.resolve().parent}"
+        raise InputError(f"{map_layer}: {text}; {way}", parameter="adopt")
     if dry:
         return
     written = written or map_layer
@@ -445,25 +430,19 @@ def _read_placed(prim: Usd.Prim, check_network: bool, notes: list[str]) -> Place
     world = UsdGeom.XformCache().GetLocalToWorldTransform(prim)
     rows = np.array(world)[:3, :3]
     if np.abs(rows @ rows.T - np.eye(3)).max() > SAME or rows[0] @ np.cross(rows[1], rows[2]) < 0:
-        raise InputError(
-            f"{place(prim)}: the robot is scaled or mirrored; clear its scale and those above it"
-        )
+        text = "the robot is scaled or mirrored; clear its scale and those above it"
+        raise InputError(f"{place(prim)}: {text}")
     robot = read_robot(prim)
-    network = robot.magnetometer.network
-    neural = robot.magnetometer.kind == "neural"
-    if check_network and neural and network is not None and not network.exists():
-        raise InputError(
-            f"{place(only_prim_with(prim, 'magnetometer'))}: magtwin:magnetometer:network names {network}, "
-            "which is not there"
-        )
+    sensor, network = only_prim_with(prim, "magnetometer"), robot.magnetometer.network
+    neural = check_network and robot.magnetometer.kind == "neural"
+    if neural and network is not None and not network.exists():
+        text = f"magtwin:magnetometer:network names {network}, which is not there"
+        raise InputError(f"{place(sensor)}: {text}")
     p, q = read_pose(prim)
     if UsdGeom.XformCache().GetParentToWorldTransform(prim) != Gf.Matrix4d(1):
         p, q, _ = read_transform(prim)
     if rows[2, 2] < UPRIGHT or abs(p[2]) > LEVEL_M:
-        notes.append(
-            f"{place(prim)}: stands {p[2]:g} m above the floor or tilted; a run starts it on the floor"
-        )
-    try:
+        text = f"stands {p[2]:g} m above the floor or tilted; a run starts it on the floor"
+        notes.append(f"{place(prim)}: {text}")
+    with about(f"{place(prim)}:"):
         return PlacedRobot(robot=robot, start=(p[0], p[1], float(yaw_from_quat(q))), path=read_path(prim))
-    except InputError as error:
-        raise InputError(f"{place(prim)}: {error}") from error

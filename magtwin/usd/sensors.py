@@ -31,6 +31,12 @@ from magtwin.usd.schema import (
 
 S = TypeVar("S")
 
+ON_ROOT: dict[str, type] = {"platform": PlatformFieldSpec, "mocap": MocapSpec, "plant": PlantSpec}
+"""Specs of what a robot's root prim has, by the nouns of their schemas."""
+
+OPTIONAL = ("mocap", "plant")
+"""Those without which a robot has the default."""
+
 POSE_FIELDS = frozenset(("link", "p_link_sensor", "q_link_sensor_xyzw"))
 """Fields of a MountSpec, which are the prim's parent and transform."""
 
@@ -252,40 +258,18 @@ def read_drive(prim: Usd.Prim) -> DriveSpec:
     return read_spec(DriveSpec, prim, "drive", **joints)
 
 
-def define_platform(prim: Usd.Prim, spec: PlatformFieldSpec) -> Usd.Prim:
-    """Apply the robot's own magnetic field to its root prim."""
-    return write_spec(apply_api(prim, "platform"), "platform", spec)
-
-
-def read_platform(prim: Usd.Prim) -> PlatformFieldSpec:
-    """The spec of an authored platform field; errors as for `read_magnetometer`."""
-    return read_spec(PlatformFieldSpec, prim, "platform")
-
-
-def define_plant(prim: Usd.Prim, spec: PlantSpec) -> Usd.Prim:
-    """Apply the field beyond the linear platform field to a robot's root prim, unless there is none."""
-    if spec == PlantSpec() and not has_api(prim, "plant"):
+def define_on_root(prim: Usd.Prim, noun: str, spec: Any) -> Usd.Prim:
+    """Apply one of `ON_ROOT` to a robot's root prim; a plant without effect only over another."""
+    if noun == "plant" and spec == PlantSpec() and not has_api(prim, "plant"):
         return prim
-    return write_spec(apply_api(prim, "plant"), "plant", spec)
+    return write_spec(apply_api(prim, noun), noun, spec)
 
 
-def read_plant(prim: Usd.Prim) -> PlantSpec:
-    """The plant of the robot rooted at `prim`, or one without effect."""
-    if not has_api(prim, "plant"):
-        return PlantSpec()
-    return read_spec(PlantSpec, prim, "plant")
-
-
-def define_mocap(prim: Usd.Prim, spec: MocapSpec) -> Usd.Prim:
-    """Apply the settings of motion capture to a robot's root prim."""
-    return write_spec(apply_api(prim, "mocap"), "mocap", spec)
-
-
-def read_mocap(prim: Usd.Prim) -> MocapSpec:
-    """Settings of motion capture of the robot rooted at `prim`, or the default."""
-    if not has_api(prim, "mocap"):
-        return MocapSpec()
-    return read_spec(MocapSpec, prim, "mocap")
+def read_on_root(prim: Usd.Prim, noun: str) -> Any:
+    """The spec of one of `ON_ROOT` of the robot rooted at `prim`; errors as for `read_magnetometer`."""
+    if noun in OPTIONAL and not has_api(prim, noun):
+        return ON_ROOT[noun]()
+    return read_spec(ON_ROOT[noun], prim, noun)
 
 
 def _define_xform(stage: Usd.Stage, path: str | Sdf.Path) -> Usd.Prim:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pxr import Gf, Sdf, UsdGeom, Vt
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, about
 from magtwin.usd.attributes import read_axis, read_number
 
 SEGMENTS = 32
@@ -49,10 +49,8 @@ def solid_of(gprim: UsdGeom.Gprim) -> Solid | None:
     """
     prim = gprim.GetPrim()
     if prim.IsA(UsdGeom.Mesh):
-        try:
+        with about(f"{prim.GetPath()}:"):
             return mesh_solid(UsdGeom.Mesh(prim))
-        except InputError as error:
-            raise InputError(f"{prim.GetPath()}: {error}") from error
     kind = prim.GetTypeName()
     if kind == "Cube":
         return _faces(*box(read_number(prim, "size")))

@@ -44,8 +44,8 @@ def mixed_units(stage: Usd.Stage) -> Iterator[str]:
     for layer in stage.GetLayerStack(includeSessionLayers=False):
         if layer in foreign:
             yield (
-                f"{root.realPath}: its sublayer {layer.realPath} has {_said(_units(layer, root))}, the stage "
-                f"{_said(own)}, and USD converts neither; reference it from a prim that scales it, or "
+                f"{root.realPath}: its sublayer {layer.realPath} has {said(_units(layer, root))}, the stage "
+                f"{said(own)}, and USD converts neither; reference it from a prim that scales it, or "
                 "convert it"
             )
     for prim in stage.Traverse():
@@ -64,7 +64,7 @@ def mixed_units(stage: Usd.Stage) -> Iterator[str]:
             seen.add(layer)
             turn = "" if there[1] == here[1] else f" and {'rotateX -90' if here[1] == 'Y' else 'rotateX 90'}"
             yield (
-                f"{place(prim)}: brings in {layer.realPath} of {_said(there)}, in {_said(here)}, and USD "
+                f"{place(prim)}: brings in {layer.realPath} of {said(there)}, in {said(here)}, and USD "
                 f"converts neither; give it scale {there[0] / here[0]:g}{turn}, or convert that file"
             )
 
@@ -107,7 +107,8 @@ def _units(layer: Sdf.Layer, root: Sdf.Layer) -> tuple[float, str]:
     return round(float(found[0]), 9), str(found[1])
 
 
-def _said(units: tuple[float, str]) -> str:
+def said(units: tuple[float, str]) -> str:
+    """Metres a unit and up axis in words."""
     return f"{units[0]:g} m a unit and {units[1]} up"
 
 

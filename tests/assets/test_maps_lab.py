@@ -1,7 +1,8 @@
 """The default map: made by the committed script and robot, with the figures of the published survey."""
 
-import importlib.util
+import runpy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,10 +22,7 @@ LAB = shipped("maps", "lab")
 @pytest.fixture(scope="module")
 def script():
     """maps/lab/build.py as a module."""
-    spec = importlib.util.spec_from_file_location("build_lab", LAB / "build.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return SimpleNamespace(**runpy.run_path(str(LAB / "build.py")))
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-import importlib.util
+import runpy
 
 import numpy as np
 import pytest
@@ -50,10 +50,8 @@ def test_a_fresh_build_equals_the_committed_asset_byte_for_byte(tmp_path):
 
 def test_the_meshes_and_the_urdf_are_what_the_script_draws(tmp_path):
     pytest.importorskip("mapbox_earcut")
-    spec = importlib.util.spec_from_file_location("turtlebot4_build", HOME / "build.py")
-    build = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(build)
-    assert build.write(tmp_path).read_text() == (HOME / "turtlebot4.urdf").read_text()
+    build = runpy.run_path(str(HOME / "build.py"))
+    assert build["write"](tmp_path).read_text() == (HOME / "turtlebot4.urdf").read_text()
     drawn = {p.name: p.read_text() for p in (tmp_path / "meshes").iterdir()}
     assert drawn == {p.name: p.read_text() for p in (HOME / "meshes").iterdir()}
 

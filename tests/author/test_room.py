@@ -1,9 +1,10 @@
 """A room from its TOML alone: furniture, the survey by its robot, refusals, and the file to start from."""
 
-import importlib.util
 import re
+import runpy
 from dataclasses import fields, is_dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -316,11 +317,7 @@ def starter(tmp_path_factory):
 
 def test_the_page_of_keys_is_what_the_dataclasses_give():
     docs = Path(magtwin.__file__).parents[1] / "docs"
-    module = importlib.util.spec_from_file_location("scenes_page", docs / "scenes.py")
-    assert module is not None
-    assert module.loader is not None
-    made = importlib.util.module_from_spec(module)
-    module.loader.exec_module(made)
+    made = SimpleNamespace(**runpy.run_path(str(docs / "scenes.py")))
     page = made.page()
     assert (docs / "scenes.md").read_text(encoding="utf-8") == page, "python docs/scenes.py writes it"
     unsaid = [line for line in page.splitlines() if re.match(r"\| `\w+` .*\|\s+\|$", line)]

@@ -1,10 +1,11 @@
 """Scenes in Python: rooms call by call, changes by name, and one scene behind TOML, Python and USD."""
 
 import dataclasses
-import importlib.util
+import runpy
 import typing
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -263,9 +264,7 @@ def test_simulate_warns_of_the_robots_that_it_leaves_out(room):
 
 
 def test_the_page_author_in_python_runs_from_an_empty_folder(tmp_path, monkeypatch):
-    spec = importlib.util.spec_from_file_location("page", ROOT / "docs" / "python.py")
-    page = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(page)
+    page = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "python.py")))
     text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     page.files(text, tmp_path)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from validators import assert_valid
 
 from magtwin.author.room import obstacles_in
-from magtwin.author.walls import DoorTable, WallTable, with_walls
+from magtwin.author.walls import DoorTable, WallTable, lab_with_walls
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.field.sources.bodies import MU_0, Bodies
 from magtwin.field.sources.magnets import body_of
@@ -274,17 +274,13 @@ def test_the_sides_of_a_floor_close_its_border():
 
 
 def test_default_magnetization_is_that_of_steel_in_the_wall():
-    drawn = [
-        abs(
-            with_walls(LabSpec(), [WallTable((0, 0), (1, 0), material="reinforced_concrete")], [], seed=s)
-            .walls[0]
-            .magnetization
-        )
-        for s in range(200)
-    ]
+    concrete, wall = WallTable((0, 0), (1, 0), material="reinforced_concrete"), WallTable((0, 0), (1, 0))
+    made = [lab_with_walls(LabSpec(), [concrete], [], [], "", seed=s) for s in range(200)]
+    drawn = [abs(lab.walls[0].magnetization) for lab in made]
     assert 5 <= min(drawn) < 8
     assert 45 < max(drawn) <= 50
-    assert with_walls(LabSpec(), [WallTable((0, 0), (1, 0))], [DoorTable(0, 0.5)]).doors[0].magnetization == 0
+    with_door = lab_with_walls(LabSpec(), [wall], [DoorTable(0, 0.5)], [], "", seed=0)
+    assert with_door.doors[0].magnetization == 0
 
 
 WALL = '[[wall]]\nname = "a"\nfrom = [0, 1]\nto = [4, 1]\n'

@@ -129,12 +129,12 @@ SPECS = {
 @given(st.data())
 def test_a_spec_survives_the_stage_to_the_bit(noun, data):
     spec, stage = data.draw(SPECS[noun]), stage_with_link()
+    root = stage.GetPrimAtPath("/robot")
+    if noun in sensors.ON_ROOT:
+        assert sensors.read_on_root(sensors.define_on_root(root, noun, spec), noun) == spec
+        return
     define, read = (getattr(sensors, f"{verb}_{noun}") for verb in ("define", "read"))
-    if noun in ("mocap", "platform", "footprint"):
-        prim = define(stage.GetPrimAtPath("/robot"), spec)
-    else:
-        prim = define(stage, f"{LINK}/{noun}", spec)
-    assert read(prim) == spec
+    assert read(define(root, spec) if noun == "footprint" else define(stage, f"{LINK}/{noun}", spec)) == spec
 
 
 def test_a_sensor_is_placed_where_the_spec_says():

@@ -39,11 +39,9 @@ def read_grid(
     yaml_file = path if path.suffix.lower() in (".yaml", ".yml") else path.with_suffix(".yaml")
     table = _yaml(yaml_file) if yaml_file.exists() else {}
     if not table and scale is None:
-        raise InputError(
-            f"{path}: a map without a scale: no {yaml_file.name} is beside it; give that file, or `scale=M`, "
-            "metres per cell",
-            parameter="scale",
-        )
+        way = "give that file, or `scale=M`, metres per cell"
+        text = f"a map without a scale: no {yaml_file.name} is beside it; {way}"
+        raise InputError(f"{path}: {text}", parameter="scale")
     picture = yaml_file.parent / str(table["image"]) if path == yaml_file else path
     cells = _picture(existing(picture, "picture of a map"))
     step = scale or _number(table, "resolution", yaml_file)
@@ -60,9 +58,8 @@ def read_grid(
         return np.round(p @ turn.T + (x, y), 3)
 
     floor = placed(outline(shape))
-    bars = [
-        bar for p in shape.to_polygons() if area(np.asarray(p)) < 0 for bar in _island(np.asarray(p)[::-1])
-    ]
+    borders = [np.asarray(p) for p in shape.to_polygons()]
+    bars = [bar for p in borders if area(p) < 0 for bar in _island(p[::-1])]
     notes = [
         f"{step:g} m a cell; the floor is the largest free part of the map, of {shape.area():.1f} m2",
         f"x and y are those of the map, whose lower left corner is ({x:g}, {y:g})",
@@ -83,9 +80,8 @@ def _yaml(file: Path) -> dict[str, Any]:
     if not isinstance(table, dict) or not {"image", "resolution"} <= table.keys():
         raise InputError(f"{file}: not a map of map_server: it has no image and resolution")
     origin = table.get("origin", [0, 0, 0])
-    if not (
-        isinstance(origin, list) and all(isinstance(n, int | float) for n in origin) and len(origin) in (2, 3)
-    ):
+    listed = isinstance(origin, list) and len(origin) in (2, 3)
+    if not (listed and all(isinstance(n, int | float) for n in origin)):
         raise InputError(f"{file}: origin must be [x, y, yaw], got {origin!r}")
     return table
 

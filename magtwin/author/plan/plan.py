@@ -17,7 +17,7 @@ from magtwin.author.plan.grid import read_grid
 from magtwin.author.plan.svg import read_svg
 from magtwin.author.rooms import EARTH
 from magtwin.author.tables import tables_of_lab, toml_text
-from magtwin.errors import InputError
+from magtwin.errors import InputError, about
 from magtwin.files.file import existing
 from magtwin.spec.base import Vec2
 from magtwin.spec.lab import LabSpec, off_floor_m
@@ -77,26 +77,20 @@ def plan_toml(path: Path, name: str, scale: float | None = None) -> tuple[str, l
     """
     path, suffix = existing(path, "floor plan"), path.suffix.lower()
     if suffix not in (*READERS, *GRIDS):
-        raise InputError(
-            f"{path}: a floor plan is .svg, .dxf, .geojson, or .pgm or .yaml of an occupancy map"
-        )
+        kinds = ".svg, .dxf, .geojson, or .pgm or .yaml of an occupancy map"
+        raise InputError(f"{path}: a floor plan is {kinds}")
     if scale is not None and not 0 < scale < math.inf:
         raise InputError(f"scale must be above 0 metres per unit, got {scale!r}", parameter="scale")
     if suffix in GRIDS:
         corners, bars, notes = read_grid(path, scale)
-        plan = Plan(
-            corners,
-            {"wall_height_m": HIGH_M},
-            [_wall(k, p, thick) for k, (p, thick) in enumerate(bars)],
-            notes=notes,
-        )
+        walls = [_wall(k, p, thick) for k, (p, thick) in enumerate(bars)]
+        plan = Plan(corners, {"wall_height_m": HIGH_M}, walls, notes=notes)
     else:
         plan = _plan(READERS[suffix](path), path, scale)
     if len(plan.walls) > MOST_WALLS:
-        raise InputError(
-            f"{path}: {len(plan.walls):,} walls, at most {MOST_WALLS:,}; leave out what is no wall"
-        )
-    try:
+        count = f"{len(plan.walls):,} walls, at most {MOST_WALLS:,}"
+        raise InputError(f"{path}: {count}; leave out what is no wall")
+    with about(f"{path}:"):
         lab = LabSpec(floor=plan.floor, **plan.sides)  # type: ignore[arg-type]
         off = {wall.name for wall in plan.walls if off_floor_m(wall, lab)[1].min() > 0}
         if off:
@@ -108,8 +102,6 @@ def plan_toml(path: Path, name: str, scale: float | None = None) -> tuple[str, l
             doors=tuple(each for each in openings if isinstance(each, Door)),
             windows=tuple(each for each in openings if isinstance(each, Window)),
         )
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     head = HEAD.format(name=name, file=path.name, notes="".join(f"# {note}\n" for note in plan.notes))
     return head + toml_text({"name": name, **REST, **tables_of_lab(lab)}), plan.notes
 
@@ -129,11 +121,9 @@ def _plan(drawing: Drawing, path: Path, scale: float | None) -> Plan:
     if metres is None:
         raise InputError(f"{path}: a plan without a scale: {drawing.stated}; {way}", parameter="scale")
     if not SIZE_M[0] <= metres * size.max() <= SIZE_M[1]:
-        raise InputError(
-            f"{path}: would be {metres * size[0]:.4g} x {metres * size[1]:.4g} m large, since "
-            f"{drawing.stated if scale is None else f'scale is {scale:g}'}; {way}",
-            parameter="scale",
-        )
+        large = f"would be {metres * size[0]:.4g} x {metres * size[1]:.4g} m large"
+        since = drawing.stated if scale is None else f"scale is {scale:g}"
+        raise InputError(f"{path}: {large}, since {since}; {way}", parameter="scale")
     plan = Plan(notes=list(drawing.notes))
     told = drawing.stated if scale is None else "as told"
     plan.notes.insert(0, f"one unit is {metres:.6g} m ({told}); ({low[0]:.10g}, {low[1]:.10g}) is the origin")
@@ -151,13 +141,12 @@ def _plan(drawing: Drawing, path: Path, scale: float | None) -> Plan:
     if not bars and floor is None:
         raise InputError(f"{path}: no walls in it, only {', '.join(k for k, v in kinds.items() if v and k)}")
     plan.walls = [_wall(k, p, thick) for k, (p, thick) in enumerate(bars)]
-    sides = () if floor is None else LabSpec(floor=_corners(floor.p)).sides
+    plan.floor = () if floor is None else _corners(floor.p)
+    sides = LabSpec(floor=plan.floor).sides if plan.floor else ()
     for kind in ("door", "window"):
         _open(plan, kinds[kind], kind, sides)
-    if floor is not None:
-        plan.floor = _corners(floor.p)
-        plan.sides = {"wall_height_m": HIGH_M, "wall_thickness_m": THICK_M}
-    else:
+    plan.sides = {"wall_height_m": HIGH_M, "wall_thickness_m": THICK_M}
+    if floor is None:
         plan.sides = {"wall_height_m": 0.0}
         plan.floor = _corners(np.round(enclosed([np.array(corners_of(wall)) for wall in plan.walls]), 3))
     return plan
@@ -179,9 +168,8 @@ def _corners(p: Array) -> tuple[Vec2, ...]:
 
 def _outer(lines: list[Line]) -> Line | None:
     """The closed line in which all others are, if there is one."""
-    low, high = (
-        f([f(line.p, axis=0) for line in lines or [Line(np.zeros((1, 2)))]], axis=0) for f in (np.min, np.max)
-    )
+    every = np.vstack([line.p for line in lines]) if lines else np.zeros((1, 2))
+    low, high = every.min(axis=0), every.max(axis=0)
     for line in lines:
         around = np.all(line.p.min(axis=0) <= low + NEAR_M) and np.all(line.p.max(axis=0) >= high - NEAR_M)
         if line.closed and around and as_bar(line.p) is None:
@@ -246,16 +234,12 @@ def _place(span: Array, walls: tuple[Wall, ...]) -> tuple[Wall | None, Array] | 
         start, along = np.array(wall.start), (np.array(wall.end) - wall.start) / wall.length_m
         s, d = (span - start) @ along, (span - start) @ [-along[1], along[0]]
         first, last = float(s.min()), float(s.max())
-        if (
-            np.abs(d).max() <= wall.thickness_m / 2 + NEAR_M
-            and first >= -NEAR_M
-            and last <= wall.length_m + NEAR_M
-        ):
+        beside = np.abs(d).max() <= wall.thickness_m / 2 + NEAR_M
+        if beside and first >= -NEAR_M and last <= wall.length_m + NEAR_M:
             return wall, np.clip([first, last], 0.0, wall.length_m)
     ends = np.array([end for wall in walls for end in (wall.start, wall.end)]).reshape(-1, 2)
-    if len(ends) and all(np.hypot(*(ends - p).T).min() < 2 * NEAR_M for p in span):
-        return None, span
-    return None
+    in_gap = len(ends) and all(np.hypot(*(ends - p).T).min() < 2 * NEAR_M for p in span)
+    return (None, span) if in_gap else None
 
 
 HEAD = """\

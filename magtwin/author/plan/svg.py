@@ -76,9 +76,8 @@ def read_svg(path: Path) -> Drawing:
             return
         where = f"{path}:{markup.lines[element]}"
         to_page = to_page @ _transform(element.get("transform", ""), where)
-        names = [
-            v for k, v in element.items() if k in ("id", "class") or k.endswith(":label") or k == "data-name"
-        ]
+        naming = ("id", "class", "data-name")
+        names = [v for k, v in element.items() if k in naming or k.endswith(":label")]
         layer = " ".join([layer, *names])
         used = named.get((element.get("href") or element.get(LINK) or "").removeprefix("#"))
         if tag == "use" and used is not None and depth < DEEPEST:
@@ -86,12 +85,12 @@ def read_svg(path: Path) -> Drawing:
             for child in [used] if _tag(used) != "symbol" else used:
                 walk(child, moved, layer, style, depth + 1)
         for p, closed in _shapes(element, tag, where, curved):
-            if tag == "rect" and _is_page(p, view, style):
-                continue
+            stroked = style.get("stroke", "none") != "none"
+            page = 0.99 * np.array(view[2:] if len(view) == 4 else [np.inf, np.inf])
+            if tag == "rect" and not stroked and np.all(np.ptp(p, axis=0) >= page):
+                continue  # the page's background
             on_page = np.column_stack([p, np.ones(len(p))]) @ (flip @ to_page).T
-            stroke = (
-                _length(style.get("stroke-width", ""))[0] if style.get("stroke", "none") != "none" else 0.0
-            )
+            stroke = _length(style.get("stroke-width", ""))[0] if stroked else 0.0
             wide = stroke * math.sqrt(abs(np.linalg.det(to_page[:2, :2])))
             drawing.lines.append(Line(on_page[:, :2], closed, layer, wide))
         for child in element:
@@ -158,18 +157,10 @@ def _transform(text: str, where: str) -> Array:
                 step = np.eye(3)
                 step[{"skewX": (0, 1), "skewY": (1, 0)}[name]] = math.tan(math.radians(n[0]))
         except (IndexError, KeyError) as error:
-            raise InputError(
-                f"{where}: transform {name}({inside})"[:120] + " is none of SVG; correct it"
-            ) from error
+            text = f"{where}: transform {name}({inside})"[:120]
+            raise InputError(f"{text} is none of SVG; correct it") from error
         matrix = matrix @ step
     return matrix
-
-
-def _is_page(p: Array, view: list[float], style: Mapping[str, str]) -> bool:
-    """Whether a rectangle is the page's background: as large as the page, without a stroke."""
-    if len(view) != 4 or style.get("stroke", "none") != "none":
-        return False
-    return bool(np.all(np.ptp(p, axis=0) >= 0.99 * np.array(view[2:])))
 
 
 def _shapes(element: Element, tag: str, where: str, curved: set[str]) -> Iterator[tuple[Array, bool]]:

@@ -90,20 +90,16 @@ class Newton:
                 if command is not None:
                     last = float(command[0]), float(command[1])
                     if not all(map(math.isfinite, last)):
-                        raise InputError(
-                            f"the command at {k * dt:.3f} s is not finite: v, w = {last!r}; a controller "
-                            "must give numbers"
-                        )
+                        text = f"the command at {k * dt:.3f} s is not finite: v, w = {last!r}"
+                        raise InputError(f"{text}; a controller must give numbers")
                 elif age > drive.command_timeout_s + LATE_S:
                     last = 0.0, 0.0
                 target = limit(*last, *target)
                 rates = []
                 for _ in range(parts):
                     mean = [b + in_mean * (a - b) for a, b in zip(wheels, target, strict=True)]
-                    wheels = (
-                        target[0] + left * (wheels[0] - target[0]),
-                        target[1] + left * (wheels[1] - target[1]),
-                    )
+                    (v, w), (v0, w0) = wheels, target
+                    wheels = v0 + left * (v - v0), w0 + left * (w - w0)
                     rolls = mean[0] * radius, mean[1] * radius / separation
                     rates.append(wheel_rates(*rolls, drive).tolist())
                 if target == (0.0, 0.0) and abs(wheels[0]) < REST_M_S and abs(wheels[1]) < rest_w:
@@ -112,10 +108,9 @@ class Newton:
                 commanded.append(last)
                 yaw += wrapped(rows[-1][2] - yaw)
                 if rows[-1][8] < UPRIGHT or not math.isfinite(rows[-1][7]):
-                    raise InputError(
-                        f"{self.stage}: {self.robot.name} fell over in Newton after {(k + 1) * dt:.2f} s; "
-                        "drive more gently, or look at its masses and colliders"
-                    )
+                    text = f"{self.robot.name} fell over in Newton after {(k + 1) * dt:.2f} s"
+                    way = "drive more gently, or look at its masses and colliders"
+                    raise InputError(f"{self.stage}: {text}; {way}")
                 if guide.done and wheels == (0.0, 0.0):
                     break
         seen = np.array(rows)

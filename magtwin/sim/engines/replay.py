@@ -41,10 +41,8 @@ def replayed(run: Run, drive: DriveSpec) -> SampledMotion:
     ):
         rows = np.flatnonzero(broken)
         if len(rows):
-            raise InputError(
-                f"row {rows[0] + 1} of {run.rows} of the run to replay: {what} (t = {t[rows[0]]:g} s); leave "
-                "such rows out"
-            )
+            row = f"row {rows[0] + 1} of {run.rows} of the run to replay"
+            raise InputError(f"{row}: {what} (t = {t[rows[0]]:g} s); leave such rows out")
     from_start = t[0] == 0
     t = t - t[0]
     pose[:, 2] = np.unwrap(pose[:, 2])

@@ -41,16 +41,9 @@ class WorldProcess:
             FilePath(folder, name).write_text(text, encoding="utf-8")
         self._log = open(FilePath(folder, "log"), "w+", encoding="utf-8", errors="replace")
         self._held.enter_context(self._log)
-        self._process = subprocess.Popen(
-            self._command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._log,
-            text=True,
-            bufsize=1,
-            cwd=folder,
-            env=environment,
-        )
+        pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": self._log}
+        options: Any = {"text": True, "bufsize": 1, "cwd": folder, "env": environment}
+        self._process = subprocess.Popen(self._command, **pipes, **options)
         self._late = self._held.enter_context(limited(self._process, self._limit_s))
         self._send(self._job)
         return self

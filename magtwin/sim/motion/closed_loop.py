@@ -85,9 +85,7 @@ class ClosedLoop:
         drive, dt = self.drive, self.dt
         left = math.exp(-dt / drive.motor_lag_s) if drive.motor_lag_s else 0.0
         radius, separation = (1.0 + error for error in self.wheel_errors)
-        fixed = loop.Drive(
-            *limits(drive, dt),
-            dt=dt,
+        fixed = limits(drive, dt)._replace(
             left_at_end=left,
             left_in_mean=drive.motor_lag_s / dt * (1.0 - left),
             slip=drive.slip_s2_m / dt,
@@ -275,19 +273,8 @@ def motion_of(closed_loop: ClosedLoop, record: Array) -> Motion:
     poses[0] = closed_loop.pose0
     for rows in mapped.parts(len(x)):
         poses[rows.start + 1 : rows.stop + 1] = np.stack([x[rows], y[rows], yaw[rows]], axis=1)
-    return Motion(
-        closed_loop.drive,
-        closed_loop.dt,
-        v,
-        w,
-        closed_loop.pose0,
-        wheel_v=wheel_v,
-        wheel_w=wheel_w,
-        v_cmd=v_cmd,
-        w_cmd=w_cmd,
-        bump=bump > 0,
-        poses=poses,
-    )
+    known = {"wheel_v": wheel_v, "wheel_w": wheel_w, "v_cmd": v_cmd, "w_cmd": w_cmd, "poses": poses}
+    return Motion(closed_loop.drive, closed_loop.dt, v, w, closed_loop.pose0, bump=bump > 0, **known)
 
 
 class Chassis:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError, RepairWarning
 from magtwin.files.kinds import expected
 from magtwin.files.outputs import output
-from magtwin.report.summary import Summarized, Summary
+from magtwin.report.summary import Summarized, Summary, span
 from magtwin.spec.drive import DriveSpec
 from magtwin.tables.delimited import QUOTED
 from magtwin.tables.labels import split_label
@@ -47,23 +47,20 @@ class Commands(Summarized):
             size = np.abs(self.rows[:, column])
             over = np.count_nonzero(size > most)
             if over:
-                parts.append(
-                    f"{over} of {len(size)} commands have |{name}| above {most:g} {unit} (to {size.max():g})"
-                )
+                above = f"above {most:g} {unit} (to {size.max():g})"
+                parts.append(f"{over} of {len(size)} commands have |{name}| {above}")
         return f"{self.name}: {', and '.join(parts)}; the drive limits them" if parts else ""
 
     def _summary(self) -> Summary:
         t, v, w = self.rows.T
-        return Summary(
-            f"Commands {self.name}: {len(t):,} rows, {t[-1] - t[0]:.4g} s"
-            if len(t)
-            else f"Commands {self.name}",
-            (
-                ("v", f"{v.min(initial=np.inf):.3g} to {v.max(initial=-np.inf):.3g} m/s" if len(t) else ""),
-                ("w", f"{w.min(initial=np.inf):.3g} to {w.max(initial=-np.inf):.3g} rad/s" if len(t) else ""),
-                ("file", self.file),
-            ),
+        title, file = f"Commands {self.name}", ("file", self.file)
+        if not len(t):
+            return Summary(title, (file,))
+        spans = (
+            ("v", span(v.min(), v.max(), "m/s", form=".3g")),
+            ("w", span(w.min(), w.max(), "rad/s", form=".3g")),
         )
+        return Summary(f"{title}: {len(t):,} rows, {t[-1] - t[0]:.4g} s", (*spans, file))
 
 
 def read_commands(file: str | os.PathLike[str]) -> Commands:

@@ -116,20 +116,8 @@ class Guide:
 
     def command(self, t: float, x: float, y: float, yaw: float, v: float, w: float) -> tuple[float, float]:
         """As for `Controller`."""
-        v_cmd, w_cmd, self.node, self.driven_m = loop.commanded(
-            self.law,
-            self.columns,
-            self.gains,
-            self.timeout_s,
-            self.node,
-            self.driven_m,
-            t,
-            x,
-            y,
-            yaw,
-            v,
-            w,
-        )
+        law = self.law, self.columns, self.gains, self.timeout_s, self.node, self.driven_m
+        v_cmd, w_cmd, self.node, self.driven_m = loop.commanded(*law, t, x, y, yaw, v, w)
         return v_cmd, w_cmd
 
 
@@ -142,9 +130,8 @@ def guide_along(name: str, path: Path, drive: DriveSpec, *, speed: float, dt: fl
         unused = np.zeros((loop.TABLE - 2, len(p)))
         (x, y), (dx, dy) = p[0].tolist(), (p[1] - p[0]).tolist()
         gains = loop.Gains(dt, delay=dt, speed=speed, creep=speed, towards=RELEASE_GAIN)
-        return Guide(
-            law, np.vstack([p.T, unused]), gains, drive.command_timeout_s, (x, y, math.atan2(dy, dx))
-        )
+        table, pose0 = np.vstack([p.T, unused]), (x, y, math.atan2(dy, dx))
+        return Guide(law, table, gains, drive.command_timeout_s, pose0)
     columns = ("x", "y", "heading", "curvature", "speed2", "left_m")
     count = sum(len(piece.x) for piece in pieces)
     table = mapped.zeros((len(columns), count)) if count > mapped.LONG else np.empty((len(columns), count))
@@ -185,9 +172,8 @@ def guide_by_commands(commands: ArrayLike, drive: DriveSpec) -> Guide:
     back = np.flatnonzero(np.diff(rows[:, 0], prepend=-1e-300) <= 0)
     if len(back):
         i = int(back[0])
-        raise InputError(
-            f"commands must come in order of time, from 0 s up: command {i + 1} of {len(rows)} has "
-            f"t = {rows[i, 0]:g} s" + (f" after {rows[i - 1, 0]:g} s" if i else "")
-        )
+        text = f"command {i + 1} of {len(rows)} has t = {rows[i, 0]:g} s"
+        text += f" after {rows[i - 1, 0]:g} s" if i else ""
+        raise InputError(f"commands must come in order of time, from 0 s up: {text}")
     table = np.vstack([rows.T, np.zeros((loop.TABLE - 3, len(rows)))])
     return Guide(loop.COMMANDS, table, loop.Gains(), drive.command_timeout_s)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
 from magtwin.run import mapped
-from magtwin.sim.motion.loop import Limits, limited
+from magtwin.sim.motion.loop import Drive, limited
 from magtwin.spec.drive import DriveSpec
 
 Array = NDArray[np.float64]
@@ -64,9 +64,10 @@ def wheel_rates(v: ArrayLike, w: ArrayLike, drive: DriveSpec) -> Array:
     return np.stack([v - side, v + side], axis=-1) / drive.wheel_radius_m
 
 
-def limits(drive: DriveSpec, dt: float) -> Limits:
-    """Limits of a drive for steps of `dt` [s]."""
-    return Limits(
+def limits(drive: DriveSpec, dt: float) -> Drive:
+    """Limits of a drive for steps of `dt` [s], without motors and wheels."""
+    return Drive(
+        dt=dt,
         v_max=drive.v_max,
         w_max=drive.w_max,
         dv=drive.a_max * dt,
@@ -89,11 +90,9 @@ def limiter(drive: DriveSpec, dt: float) -> Callable[[float, float, float, float
 def draw_wheel_errors(drive: DriveSpec, rng: np.random.Generator) -> tuple[float, float]:
     """Relative errors of the wheels' radius and separation in one run: the session's, plus a draw."""
     radius, separation = rng.standard_normal(2).tolist()
-    shared = drive.wheel_errors
-    return (
-        shared[0] + drive.wheel_radius_error_std * radius,
-        shared[1] + drive.wheel_separation_error_std * separation,
-    )
+    radius *= drive.wheel_radius_error_std
+    separation *= drive.wheel_separation_error_std
+    return drive.wheel_errors[0] + radius, drive.wheel_errors[1] + separation
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,15 +183,8 @@ class Motion:
             raise InputError(f"v and w of a Motion must have one shape (K,), got {v.shape} and {w.shape}")
         if not (np.isfinite(v).all() and np.isfinite(w).all()):
             raise InputError("a speed or yaw rate of a Motion is not finite")
-        known = {
-            "v": v,
-            "w": w,
-            "wheel_v": v,
-            "wheel_w": w,
-            "v_cmd": v,
-            "w_cmd": w,
-            "bump": np.zeros(len(v), bool),
-        }
+        known = {"v": v, "w": w, "wheel_v": v, "wheel_w": w, "v_cmd": v, "w_cmd": w}
+        known["bump"] = np.zeros(len(v), bool)
         for name, default in known.items():
             given = getattr(self, name)
             array = default if given is None else np.asarray(given, default.dtype)

@@ -32,11 +32,8 @@ def drive_input(path: Any, room: Room | None = None, *, fit: bool = False) -> Dr
         named = isinstance(path, str | FilePath) and room is not None
         resolved = path_in(room, path) if named else resolve_path(path)  # type: ignore[arg-type]
         return fit_path(resolved, room) if fit and room is not None else resolved
-    raise InputError(
-        "path must be a name, a CSV file, points (N, 2) [m], a Path, Commands or a Run, got "
-        f"{type(path).__name__}",
-        parameter="path",
-    )
+    text = "path must be a name, a CSV file, points (N, 2) [m], a Path, Commands or a Run"
+    raise InputError(f"{text}, got {type(path).__name__}", parameter="path")
 
 
 def check_path(path: Any) -> None:

@@ -71,19 +71,17 @@ class Driver:
     ) -> None:
         """Measure the room."""
         if not 0 < speed <= drive.v_max:
-            raise InputError(
-                f"speed must be above 0 and at most {drive.v_max:g} m/s, the drive's v_max; got {speed!r}"
-            )
+            most = f"at most {drive.v_max:g} m/s, the drive's v_max"
+            raise InputError(f"speed must be above 0 and {most}; got {speed!r}")
         self._drive, self._rng, self._speed, self._duration_s = drive, rng, speed, duration_s
         self._keep = footprint_radius_m + MARGIN_M
         x0, x1, y0, y1 = lab.extent_m
         self._low = x0, y0
         self._clear = _clearances(lab, obstacles)
         if self._clearance(start[0], start[1]) < self._keep:
-            raise InputError(
-                f"a driver has no room at ({start[0]:.3f}, {start[1]:.3f}) m: less than {self._keep:.3f} m "
-                "from a wall or an obstacle; begin elsewhere"
-            )
+            near = f"less than {self._keep:.3f} m from a wall or an obstacle"
+            at = f"({start[0]:.3f}, {start[1]:.3f}) m"
+            raise InputError(f"a driver has no room at {at}: {near}; begin elsewhere")
         across = [np.arange(low + PLACE_M / 2, high, PLACE_M) for low, high in ((x0, x1), (y0, y1))]
         grid = np.array([(x, y) for x in across[0] for y in across[1]])
         free = [self._clearance(x, y) > self._keep + 0.05 for x, y in grid.tolist()]
@@ -113,14 +111,10 @@ class Driver:
     def _decide(self, t: float, x: float, y: float, yaw: float, v: float) -> tuple[float, float]:
         """Decide on a command."""
         drive = self._drive
-        noise_v, noise_w, begins = (
-            self._rng.standard_normal(),
-            self._rng.standard_normal(),
-            self._rng.random(),
-        )
-        for name, noise, tau in (("_ou_v", noise_v, SPEED_TAU_S), ("_ou_w", noise_w, TURN_TAU_S)):
-            left = math.exp(-DECIDE_S / tau)
+        for name, tau in (("_ou_v", SPEED_TAU_S), ("_ou_w", TURN_TAU_S)):
+            left, noise = math.exp(-DECIDE_S / tau), self._rng.standard_normal()
             setattr(self, name, left * getattr(self, name) + math.sqrt(1 - left * left) * noise)
+        begins = self._rng.random()
         self._visit(t, x, y)
         if t < self._pause_until:
             return 0.0, 0.0
@@ -130,9 +124,8 @@ class Driver:
         off = self._direction(x, y, yaw)
         wanted_w = STEER * off + TURN_STD * self._ou_w
         wanted_w = min(max(wanted_w, -0.9 * drive.w_max), 0.9 * drive.w_max)
-        wanted_v = (
-            self._speed * (1.0 + SPEED_SHARE * self._ou_v) * max(0.0, math.cos(min(abs(off), math.pi / 2)))
-        )
+        ahead = max(0.0, math.cos(min(abs(off), math.pi / 2)))
+        wanted_v = self._speed * (1.0 + SPEED_SHARE * self._ou_v) * ahead
         wanted_v = min(max(wanted_v, 0.0), drive.v_max)
         for share in (1.0, 0.6, 0.3, 0.1):
             if self._safe(x, y, yaw, max(wanted_v * share, 0.0), v, wanted_w):

@@ -73,11 +73,8 @@ def loop_along(
             parameter="duration_s",
         )
     if line.length > LONGEST_M:
-        raise InputError(
-            f"path {path.name}: {line.length:.4g} m are too long, at most {LONGEST_M:g} m are planned; take "
-            "a part of it",
-            parameter="path",
-        )
+        text = f"{line.length:.4g} m are too long, at most {LONGEST_M:g} m are planned; take a part of it"
+        raise InputError(f"path {path.name}: {text}", parameter="path")
     guide = guide_along(controller, line, drive, speed=speed, dt=dt)
     assert guide.pose0 is not None
     least_s = line.length / speed if duration_s is None else duration_s
@@ -122,14 +119,11 @@ def check_arrived(path: Path, speed: float, closed_loop: ClosedLoop, motion: Tra
     """Refuse a motion that took all steps that were allowed for reaching the end of a path."""
     allowed_s = closed_loop.steps * closed_loop.dt
     if motion.duration_s > allowed_s - 0.5 * closed_loop.dt:
-        why = (
-            "the robot stands at an obstacle"
-            if motion.at([motion.duration_s]).bump[-1]
-            else "it winds too tightly for this drive: smooth it, or drive more slowly"
-        )
-        raise InputError(
-            f"path {path.name}: its end was not reached in {allowed_s:.0f} s at {speed:g} m/s; {why}"
-        )
+        why = "it winds too tightly for this drive: smooth it, or drive more slowly"
+        if motion.at([motion.duration_s]).bump[-1]:
+            why = "the robot stands at an obstacle"
+        what = f"its end was not reached in {allowed_s:.0f} s at {speed:g} m/s"
+        raise InputError(f"path {path.name}: {what}; {why}")
 
 
 def play(
@@ -185,7 +179,5 @@ def loop_by_commands(
 
 def _check_duration(duration_s: float) -> None:
     if not 0 < duration_s <= LONGEST_S:
-        raise InputError(
-            f"duration_s must be above 0 s and finite, at most {LONGEST_S:g}, a day; got {duration_s!r}",
-            parameter="duration_s",
-        )
+        text = f"duration_s must be above 0 s and finite, at most {LONGEST_S:g}, a day; got {duration_s!r}"
+        raise InputError(text, parameter="duration_s")

@@ -40,8 +40,8 @@ TABLE = 6
 """Columns of a controller's table."""
 
 
-class Limits(NamedTuple):
-    """Limits of a drive for steps of one length."""
+class Drive(NamedTuple):
+    """What does not change of a robot: its limits for steps of one length, then its motors and wheels."""
 
     v_max: float
     """Speed [m/s]."""
@@ -57,32 +57,20 @@ class Limits(NamedTuple):
     """Half of the distance between the wheels [m]."""
     bend: float
     """Curvature [1/m], which may be infinite."""
-
-
-class Drive(NamedTuple):
-    """What does not change of a robot: its `Limits`, and the rest."""
-
-    v_max: float
-    w_max: float
-    dv: float
-    dw: float
-    rim: float
-    half: float
-    bend: float
     dt: float
     """Length of a step [s]."""
-    left_at_end: float
+    left_at_end: float = 0.0
     """Share of the last speed that the motors' lag leaves at the end of a step."""
-    left_in_mean: float
+    left_in_mean: float = 0.0
     """Its share in the mean of the step."""
-    slip: float
+    slip: float = 0.0
     """Slip per change of speed in a step [s/m]."""
-    scale_v: float
-    scale_w: float
+    scale_v: float = 1.0
+    scale_w: float = 1.0
     """Factors on v and w by the wheels' true size and their slip on curves."""
-    timeout: float
+    timeout: float = 0.0
     """Age at which a command is void [s]."""
-    radius: float
+    radius: float = 0.0
     """Radius of the footprint [m]."""
 
 
@@ -191,9 +179,7 @@ def wrapped(angle: float) -> float:
     return angle - TURN * math.floor((angle + math.pi) / TURN)
 
 
-def limited(
-    limits: Limits | Drive, v_wanted: float, w_wanted: float, v: float, w: float
-) -> tuple[float, float]:
+def limited(limits: Drive, v_wanted: float, w_wanted: float, v: float, w: float) -> tuple[float, float]:
     """The nearest twist to a wanted one within every limit of a drive, from the last one, v and w.
 
     If a wheel would turn too fast, the forward speed is reduced, as quickly as it may change. A robot that

@@ -156,16 +156,14 @@ def _piece(path: Path, s_first: float, s_last: float, drive: DriveSpec, speed: f
     del dx, dy, ds
     rim = _WHEEL_SHARE * drive.wheel_rate_max * drive.wheel_radius_m
     with np.errstate(divide="ignore"):
-        v = np.minimum(
-            LIMIT_SHARE * drive.w_max / np.abs(curvature), np.sqrt(LIMIT_SHARE * drive.alpha_max / bend)
-        )
+        v = LIMIT_SHARE * drive.w_max / np.abs(curvature)
+        v = np.minimum(v, np.sqrt(LIMIT_SHARE * drive.alpha_max / bend))
     v = np.minimum(v, rim / (1 + np.abs(curvature) * drive.wheel_separation_m / 2))
     v2 = np.clip(v, min(SLOWEST, speed), speed) ** 2
     del v, bend
     v2[[0, -1]] = 0.0
-    gain = (
-        2 * LIMIT_SHARE * drive.a_max * np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    )
+    driven = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    gain = 2 * LIMIT_SHARE * drive.a_max * driven
     v2 = np.minimum.accumulate(v2 - gain) + gain
     v2 = (np.minimum.accumulate((v2 + gain)[::-1]))[::-1] - gain
     left = np.arange(len(x) - 1, -1, -1) * ((s_last - s_first) / (count - 1))

@@ -25,11 +25,15 @@ from magtwin.sim.motion.engine import Travel
 from magtwin.sim.runs.driving import Course, Metadata, Trip, course_of, drive, labelled
 from magtwin.sim.runs.sensing import Conditions, Sensing, streams
 from magtwin.sim.runs.simulate import Sensed, check_run, read_all, readings, sense_all
+from magtwin.spec.drive import DRAWN
 from magtwin.spec.scene import Scene
 
 BLOCK = 16
 """Runs made at a time: 130,000 readings of a minute each, 0.1 GB, and work for every thread."""
 
+
+UNPLANNED: Any = {"wheel_errors": (0.0, 0.0), "odometry_scale": (1.0, 1.0), **dict.fromkeys(DRAWN, 0.0)}
+"""Figures of a drive on which no plan depends."""
 
 PLANNED = 1 << 27
 """Bytes of plans that are kept, beside the last: 1,000 of a minute each, or none of a day."""
@@ -230,18 +234,11 @@ class Runs(Summarized, Sequence[Run]):
 
     def _course(self, job: Job) -> Course:
         """What a job drives, planned once for jobs that share it, and again beyond `PLANNED` bytes."""
-        robot = job.scene.robot
-        alike = replace(
-            robot.drive,
-            wheel_errors=(0.0, 0.0),
-            wheel_radius_error_std=0.0,
-            wheel_separation_error_std=0.0,
-            odometry_scale=(1.0, 1.0),
-            odometry_noise_std=0.0,
-        )
         if isinstance(job.path, Run):
             return course_of(job.scene, job.path, job.speed, job.conditions)
-        key = (job.path, job.speed, alike, robot.footprint_radius_m, job.scene.start, job.conditions)
+        robot = job.scene.robot
+        alike = replace(robot.drive, **UNPLANNED), robot.footprint_radius_m
+        key = (job.path, job.speed, alike, job.scene.start, job.conditions)
         if key in self._planned:
             return self._planned[key]
         if self._kept > PLANNED:
@@ -257,18 +254,14 @@ class Runs(Summarized, Sequence[Run]):
         return f"run {index} of {len(self)}, counted from 0"
 
     def _summary(self) -> Summary:
-        names = dict.fromkeys(
-            getattr(job.path, "name", job.path) if not isinstance(job.path, Run) else "a recorded run"
-            for job in self._jobs
-        )
-        return Summary(
-            f"Runs: {len(self):,}, made when they are asked for",
-            (
-                ("paths", listed([str(name) for name in names])),
-                ("seeds", listed([str(job.seed) for job in self._jobs])),
-                ("columns", listed([name for name in COLUMNS if name in self._columns])),
-            ),
-        )
+        paths = ["a recorded run" if isinstance(job.path, Run) else job.path for job in self._jobs]
+        rows = {
+            "paths": list(dict.fromkeys(str(getattr(path, "name", path)) for path in paths)),
+            "seeds": [str(job.seed) for job in self._jobs],
+            "columns": [name for name in COLUMNS if name in self._columns],
+        }
+        title = f"Runs: {len(self):,}, made when they are asked for"
+        return Summary(title, tuple((label, listed(names)) for label, names in rows.items()))
 
 
 def _content(path: DriveInput) -> str:

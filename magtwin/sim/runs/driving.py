@@ -63,18 +63,15 @@ def course_of(scene: Scene, path: DriveInput, speed: float, conditions: Conditio
         told: Metadata = {name: path.metadata[name] for name in kept if name in path.metadata}
         return Course(path, None, speed, {**told, "engine": "replay"})
     engine: Metadata = {} if conditions.engine.name == "kinematic" else {"engine": conditions.engine.name}
-    options: dict[str, Any] = {
-        "duration_s": conditions.duration_s,
-        "footprint_radius_m": robot.footprint_radius_m,
-    }
+    options: dict[str, Any] = {"footprint_radius_m": robot.footprint_radius_m}
+    options["duration_s"] = conditions.duration_s
     if isinstance(path, Path):
         name = named if isinstance(named, str) else type(named).__name__
         plain = "follower" if _is_custom(named) else name  # the plan of a custom controller is not used
         room = conditions.obstacles
         loop = loop_along(path, robot.drive, speed=speed, controller=plain, obstacles=room, **options)
-        return Course(
-            path, loop, speed, {"path": path.name, "controller": name, "speed_m_s": float(speed), **engine}
-        )
+        told = {"path": path.name, "controller": name, "speed_m_s": float(speed)}
+        return Course(path, loop, speed, {**told, **engine})
     if isinstance(path, Commands):
         loop = loop_by_commands(path.rows, robot.drive, start=scene.start, **options)
         told = {"path": path.name, "controller": "commands"}
@@ -126,10 +123,8 @@ def labelled(label: str) -> Iterator[None]:
         raise InputError(f"{label}: {error}", parameter=error.parameter) from error
 
 
-def _is_custom(controller: str | Controller) -> bool:
-    if not isinstance(controller, str):
-        return True
-    return controller not in CONTROLLERS and controller in CUSTOM_CONTROLLERS
+def _is_custom(named: str | Controller) -> bool:
+    return not isinstance(named, str) or (named not in CONTROLLERS and named in CUSTOM_CONTROLLERS)
 
 
 def _controller(trip: Trip, conditions: Conditions) -> Controller | None:

@@ -98,11 +98,9 @@ def _check_apart(near: Iterable[Approach]) -> None:
         first = min(met, key=lambda approach: approach.meet_s or 0.0)
         a, b = first.names
         x, y = first.p_meet
-        raise InputError(
-            f"robots {a!r} and {b!r} would run into each other after {first.meet_s:.2f} s at ({x:.2f}, "
-            f"{y:.2f}) m; give one another path, start or speed, or have it flagged as a bump "
-            '(meet="flag")'
-        )
+        text = f"would run into each other after {first.meet_s:.2f} s at ({x:.2f}, {y:.2f}) m"
+        way = 'give one another path, start or speed, or have it flagged as a bump (meet="flag")'
+        raise InputError(f"robots {a!r} and {b!r} {text}; {way}")
 
 
 def _nearest(name: str, near: Iterable[Approach]) -> dict[str, str | float]:
@@ -112,8 +110,5 @@ def _nearest(name: str, near: Iterable[Approach]) -> dict[str, str | float]:
         return {}
     least = min(own, key=lambda approach: approach.clearance_m)
     other = next(other for other in least.names if other != name)
-    return {
-        "nearest_robot": other,
-        "nearest_clearance_m": round(least.clearance_m, 6),
-        "nearest_t_s": least.t_s,
-    }
+    clearance_m = round(least.clearance_m, 6)
+    return {"nearest_robot": other, "nearest_clearance_m": clearance_m, "nearest_t_s": least.t_s}

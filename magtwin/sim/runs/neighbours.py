@@ -133,15 +133,11 @@ def _at_sensor(scene: Scene, neighbours: Sequence[Neighbour], motion: Moving, t:
         earth = np.broadcast_to(scene.earth.b_world_nt, (len(t), 3))
         m_world = _turned(iron_moments(other.robot, _turned(earth, -pose[:, 2])), pose[:, 2])
         height = np.full(len(t), other.robot.base_height_m)
-        field += _dipole_each_nt(p_sensor - np.column_stack([pose[:, :2], height]), m_world)
+        r = p_sensor - np.column_stack([pose[:, :2], height])
+        d = np.sqrt(np.sum(r * r, axis=1))[:, None]  # a dipole for each row; see `dipole_field_nt`
+        along = 3 * np.sum(m_world * r, axis=1)[:, None] * r / d**5
+        field += MU_0_NT / (4 * math.pi) * (along - m_world / d**3)
     return field
-
-
-def _dipole_each_nt(r: Array, m: Array) -> Array:
-    """Field of N dipoles m (N, 3), each at its own offset r (N, 3) [nT]; see `dipole_field_nt`."""
-    d = np.sqrt(np.sum(r * r, axis=1))[:, None]
-    along = 3 * np.sum(m * r, axis=1)[:, None] * r / d**5
-    return np.asarray(MU_0_NT / (4 * math.pi) * (along - m / d**3))
 
 
 def approaches(travels: Mapping[str, Neighbour]) -> Iterator[Approach]:

@@ -141,20 +141,14 @@ class Sensing:
         added = bool(self._near or terms or self._plant)
         if (terms or self._plant) and self._exact.of == "none":
             what = "interference" if terms else "the robot's plant"
-            raise InputError(
-                f"scene {scene.name!r} has a constant map and no Earth field, so {what} has nothing to add "
-                "to; give the scene an Earth field"
-            )
+            text = f"has a constant map and no Earth field, so {what} has nothing to add to"
+            raise InputError(f"scene {scene.name!r} {text}; give the scene an Earth field")
         self._unmodelled = network and added
         self._reads = bool(self.wanted & _READ)
         self._reads_axes = network and "b_vector_measured_nt" in needed
-        self._vector = bool(
-            self._reads_axes
-            or self.wanted & _EXACT
-            or self._physical
-            or (self._reads and feels_direction(spec))
-            or added
-        )
+        directed = self._reads and feels_direction(spec)
+        exact = bool(self.wanted & _EXACT)
+        self._vector = self._reads_axes or exact or self._physical or directed or added
         self._known = self._exact.of == "sources" or (self._exact.of == "map" and (self._physical or added))
         self._sloped = "b_map_gradient_nt_m" in needed
         self.lidar_on = partial(lidar_on, robot.lidar, mode=conditions.lidar)
@@ -165,11 +159,9 @@ class Sensing:
             "mocap": Mocap(robot.mocap, robot.base_height_m, draws["mocap"]),
             "battery": self._battery,
         }
-        self.sampled = {
-            name: one
-            for name, one in every.items()
-            if needed & _MADE_TOGETHER[name] or (name == "battery" and self._vector)
-        }
+        read = {name for name in every if needed & _MADE_TOGETHER[name]}
+        read |= {"battery"} if self._vector else set()
+        self.sampled = {name: one for name, one in every.items() if name in read}
         """The sensors with their own clocks that are read, by name."""
 
         self._magnetometer = Magnetometer(spec, self.rate_hz, draws["magnetometer"])

@@ -98,10 +98,11 @@ class SteppedRobots:
         self._exact = ExactField(scene=scene, anomaly_map=anomaly_map, outside="clamp")
         self._model_error = model_error
         if scene.robot.plant != PlantSpec():
-            raise InputError(
-                f"robot {scene.robot.name!r} has a plant, which only runs simulate; leave it out"
-            )
-        self._code = _compiled()
+            text = "has a plant, which only runs simulate; leave it out"
+            raise InputError(f"robot {scene.robot.name!r} {text}")
+        self._code: ModuleType | None = None  # where numba does not work; the bytes are the same
+        with suppress(ImportError):
+            self._code = LOOPS.open()
         self._moved = Robots([loop_by_commands(STAND, scene.robot.drive)] * count, obstacles)
         self._record = np.zeros((count, loop.RECORD, self._steps))
         self._t, self._angle, self._twist = np.zeros(count), np.zeros((count, 2)), np.zeros((count, 2))
@@ -171,10 +172,8 @@ class SteppedRobots:
         """
         twists = np.asarray(commands, float)
         if twists.shape != (self.count, 2) or not np.isfinite(twists).all():
-            raise InputError(
-                f"commands must be finite v [m/s], w [rad/s] of shape {(self.count, 2)}, got shape "
-                f"{twists.shape}, {np.count_nonzero(~np.isfinite(twists))} of them not finite"
-            )
+            got = f"got shape {twists.shape}, {np.count_nonzero(~np.isfinite(twists))} of them not finite"
+            raise InputError(f"commands must be finite v [m/s], w [rad/s] of shape {(self.count, 2)}, {got}")
         rows = np.arange(self.count) if which is None else np.asarray(which, np.int64)
         if not len(rows):
             return
@@ -308,10 +307,3 @@ def _stacked_moments(moments: Sequence[Moment]) -> Moment:
 
 
 _PARTS = tuple(Moment.__dataclass_fields__)
-
-
-def _compiled() -> ModuleType | None:
-    """The compiled loop; None for plain Python, where numba does not work. The bytes are the same."""
-    with suppress(ImportError):
-        return LOOPS.open()
-    return None

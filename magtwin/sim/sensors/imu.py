@@ -1,5 +1,7 @@
 """IMU: orientation, rates and acceleration of a robot that rocks a little on its floor."""
 
+from typing import Any
+
 import numpy as np
 
 from magtwin.frames import canonical, quat_from_rpy, quat_multiply
@@ -38,14 +40,8 @@ class Imu(SampledSensor):
     ) -> None:
         """Switch the sensor on."""
         delays, noise = rng.spawn(2)
-        super().__init__(
-            noise,
-            walk=np.zeros(3),
-            drift=0.0,
-            tilt=noise.standard_normal(2),
-            bias=spec.gyro_bias,
-            yaw_zero=spec.yaw_zero,
-        )
+        start: Any = {"tilt": noise.standard_normal(2), "bias": spec.gyro_bias, "yaw_zero": spec.yaw_zero}
+        super().__init__(noise, walk=np.zeros(3), drift=0.0, **start)
         self._spec, self._q_base_imu = spec, q_base_imu_xyzw
         self._rate = spec.rate_hz if rate_hz is None else rate_hz
         self.clock = SampleClock(self._rate, spec.latency_s, spec.jitter_s, delays)
@@ -60,9 +56,8 @@ class Imu(SampledSensor):
         rates = into_sensor(np.stack([zero, zero, now.w], axis=-1), q_base_imu) + bias
         rates += np.hypot(spec.gyro_noise_std, shaking * np.array(spec.gyro_vibration)) * white[..., 3:6]
         acceleration = into_sensor(np.stack([now.a, now.v * now.w, zero], axis=-1), q_base_imu)
-        acceleration += (
-            np.hypot(spec.accel_noise_std, shaking * np.array(spec.accel_vibration)) * white[..., 6:9]
-        )
+        shaken = np.hypot(spec.accel_noise_std, shaking * np.array(spec.accel_vibration))
+        acceleration += shaken * white[..., 6:9]
         along_z = np.sum(bias * axes_in_base(tuple(q_base_imu))[2], axis=-1)
         drift = accumulate(state["drift"], along_z / self._rate)
         state["drift"] = drift[-1]

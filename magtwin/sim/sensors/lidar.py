@@ -154,17 +154,13 @@ class Scanner:
         for row, (at, axes) in enumerate(zip(p, q, strict=True)):
             if upright:
                 turn = matrix_from_quat(axes)[:2, :2]
-                hits = _cast((self._level_cuts(at[2]) - at[:2]) @ turn, spec.rays)
+                if self._cuts is None or self._cuts[0] != at[2]:  # a robot on a floor has one height
+                    self._cuts = at[2], _cuts(self._obstacles.triangles, at[2])
+                hits = _cast((self._cuts[1] - at[:2]) @ turn, spec.rays)
                 ranges[row] = _reported(hits, spec, self._noise)
             else:
                 ranges[row] = scan(self._obstacles, (at, axes), spec, self._noise)
         return Scans(stamps, arrival, p, q, ranges)
-
-    def _level_cuts(self, height: float) -> Array:
-        """Where the obstacles cross the plane of the last height; a robot on a floor has one."""
-        if self._cuts is None or self._cuts[0] != height:
-            self._cuts = height, _cuts(self._obstacles.triangles, height)
-        return self._cuts[1]
 
 
 def scans_of(run: Run, robot: RobotSpec, obstacles: Obstacles, rng: np.random.Generator) -> Scans:

@@ -4,7 +4,7 @@ import dataclasses
 
 from pxr import Sdf, Usd, UsdGeom
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, about
 from magtwin.field.sources.earth import earth_field_nt
 from magtwin.spec.base import ZERO3
 from magtwin.spec.magnetics import EarthFieldSpec
@@ -35,10 +35,8 @@ def read_earth(prim: Usd.Prim) -> EarthFieldSpec:
     spec = read_spec(EarthFieldSpec, prim, "earth")
     if spec.measured or value_of(prim.GetAttribute(DERIVED_FROM)) == _inputs(spec):
         return spec
-    try:
+    with about(f"{place(prim)}:"):
         return derived(spec)
-    except InputError as error:
-        raise InputError(f"{place(prim)}: {error}") from error
 
 
 def derived(spec: EarthFieldSpec) -> EarthFieldSpec:

@@ -84,10 +84,8 @@ def read_magnets(stage: Usd.Stage) -> tuple[tuple[SourceSpec, ...], tuple[Furnit
     root_path = labs.pop() if len(labs) == 1 else WORLD
     for prim in prims:
         if robot := next((r for r in robots if prim.GetPath().HasPrefix(r)), None):
-            raise InputError(
-                f"{place(prim)}: a magnetic source on the robot {robot}, which moves; author it as the "
-                "robot's platform field"
-            )
+            text = f"a magnetic source on the robot {robot}, which moves"
+            raise InputError(f"{place(prim)}: {text}; author it as the robot's platform field")
         if prim.GetPath() not in taken:
             sources.append(read_source(prim, name=_name(prim, root_path, names)))
             names.add(sources[-1].name)
@@ -104,24 +102,18 @@ def _whole(root: Usd.Prim, prims: list[Usd.Prim]) -> FurnitureSpec | None:
     if kind not in GENERIC:
         parts_of(kind)  # raises if the kind is unknown
     try:
-        bare = FurnitureSpec(
-            name=root.GetName(), kind=kind, p_world=p, q_world_xyzw=q, **_generic(root, kind)
-        )
+        known = {"name": root.GetName(), "kind": kind, "p_world": p, "q_world_xyzw": q}
+        bare = FurnitureSpec(**known, **_generic(root, kind))  # type: ignore[arg-type]
         along = {part.name: part.along for part in bare.parts if part.steel}
         steel = [read_source(prim, local=True) for prim in own]
         strength = tuple(source.magnetization[along.get(source.name, 0)] for source in steel)
-        spec = replace(
-            bare,
-            magnetization=strength if any(strength) else (),
-            susceptibility=steel[0].susceptibility if steel else 0.0,
-        )
+        figures = {"magnetization": strength} | ({"susceptibility": steel[0].susceptibility} if steel else {})
+        spec = replace(bare, **figures)  # type: ignore[arg-type]
     except InputError:  # it has more parts, or fewer
         return None
-    wanted = [
-        named_source(source, source.name.removeprefix(f"{spec.name}_"))
-        for source in spec.sources(in_world=False)
-    ]
-    return spec if steel == wanted else None
+    wanted = spec.sources(in_world=False)
+    same = [named_source(source, source.name.removeprefix(f"{spec.name}_")) for source in wanted]
+    return spec if steel == same else None
 
 
 def _generic(root: Usd.Prim, kind: str) -> dict[str, Any]:

@@ -81,9 +81,8 @@ def define_looks(stage: Usd.Stage, scope: Sdf.Path, names: Iterable[str]) -> Non
         surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*look.colour))
         surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(look.roughness)
         surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(look.metallic)
-        material.CreateSurfaceOutput().ConnectToSource(
-            surface.CreateOutput("surface", Sdf.ValueTypeNames.Token)
-        )
+        shown = surface.CreateOutput("surface", Sdf.ValueTypeNames.Token)
+        material.CreateSurfaceOutput().ConnectToSource(shown)
         if look.friction is not None:
             physics = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
             physics.CreateStaticFrictionAttr(look.friction)

@@ -54,9 +54,8 @@ def define_lab(stage: Usd.Stage, spec: LabSpec) -> Usd.Prim:
     Returns:
         The prim of the lab.
     """
-    lab = write_spec(
-        apply_api(UsdGeom.Xform.Define(stage, LAB).GetPrim(), "lab"), "lab", spec, skip=STRUCTURE
-    )
+    prim = UsdGeom.Xform.Define(stage, LAB).GetPrim()
+    lab = write_spec(apply_api(prim, "lab"), "lab", spec, skip=STRUCTURE)
     scene = UsdPhysics.Scene.Define(stage, PHYSICS_SCENE)
     scene.CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
     scene.CreateGravityMagnitudeAttr(GRAVITY_M_S2)
@@ -170,15 +169,8 @@ def _camera(stage: Usd.Stage, path: Sdf.Path, post_top: np.ndarray) -> None:
     define_box(stage, path.AppendChild("Body"), (0, 0, 0), CAMERA_SIZE_M, CAMERA)
     at_lens = ((CAMERA_SIZE_M[0] + LENS_SIZE_M[2]) / 2, 0.0, 0.0)
     quarter = quat_from_rpy((0.0, np.pi / 2, 0.0))
-    define_visual(
-        stage,
-        path.AppendChild("Lens"),
-        "cylinder",
-        at_lens,
-        LENS_SIZE_M,
-        LENS,
-        q_xyzw=tuple(quarter.tolist()),
-    )
+    lens, turn = path.AppendChild("Lens"), tuple(quarter.tolist())
+    define_visual(stage, lens, "cylinder", at_lens, LENS_SIZE_M, LENS, q_xyzw=turn)
 
 
 def _define_lights(stage: Usd.Stage, spec: LabSpec, middle: tuple[float, float]) -> None:
@@ -196,6 +188,5 @@ def _define_lights(stage: Usd.Stage, spec: LabSpec, middle: tuple[float, float])
         lamp.CreateIntensityAttr(LAMP)
         lamp.CreateNormalizeAttr(True)
         lamp.CreateColorAttr(Gf.Vec3f(1.0, 0.97, 0.92))
-        lamp.AddTranslateOp().Set(
-            Gf.Vec3d(middle[0] + sx * quarter[0], middle[1] + sy * quarter[1], LAMP_HEIGHT_M)
-        )
+        x, y = middle + quarter * (sx, sy)
+        lamp.AddTranslateOp().Set(Gf.Vec3d(x, y, LAMP_HEIGHT_M))

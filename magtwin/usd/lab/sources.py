@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, about
 from magtwin.field.sources.magnets import body_of
 from magtwin.field.sources.moments import mesh_moments
 from magtwin.frames import IDENTITY_XYZW, canonical, quat_conjugate, quat_multiply, rotate, xyzw_from_wxyz
@@ -72,10 +72,8 @@ def define_source(
         else:
             hide(UsdGeom.Gprim(prim), material)
         if spec.shape != "mesh" and shown:
-            turn = _turn(spec)
-            define_visual(
-                stage, visual_path(path), spec.shape, spec.p_world, spec.size_m, material, q_xyzw=turn
-            )
+            where = spec.p_world, spec.size_m, material
+            define_visual(stage, visual_path(path), spec.shape, *where, q_xyzw=_turn(spec))
     apply_api(prim, "source")
     for name, value in figures.items():
         author(prim.GetAttribute(attribute_name("source", name)), value)
@@ -159,12 +157,10 @@ def read_source(prim: Usd.Prim, *, name: str | None = None, local: bool = False)
             f"{place(prim)}: a magnetic source below a PointInstancer has no single place; reference it "
             "at its place, as an instance if needed"
         )
-    figures = {
-        key: plain_value(prim.GetAttribute(attribute_name("source", key)))
-        for key in ("moment", "magnetization", "susceptibility")
-    }
+    keys = ("moment", "magnetization", "susceptibility")
+    figures = {key: plain_value(prim.GetAttribute(attribute_name("source", key))) for key in keys}
     p, q, scale = read_transform(prim, local=local)
-    try:
+    with about(f"{place(prim)}:"):
         spec: dict[str, Any] = {"name": name or prim.GetName(), "p_world": p, "shape": shape}
         if shape == "point":
             return _point(spec, q, **figures)
@@ -176,11 +172,8 @@ def read_source(prim: Usd.Prim, *, name: str | None = None, local: bool = False)
                 raise InputError("has both a moment and a magnetization; give one of them")
             volume_m3 = body_of(SourceSpec(**spec)).volume_m3
             own["magnetization"] = _vec3(part / volume_m3 for part in own["moment"])
-        return SourceSpec(
-            **spec, magnetization=own["magnetization"], susceptibility=figures["susceptibility"]
-        )
-    except InputError as error:
-        raise InputError(f"{place(prim)}: {error}") from error
+        spec |= {"magnetization": own["magnetization"], "susceptibility": figures["susceptibility"]}
+        return SourceSpec(**spec)
 
 
 def _point(
@@ -253,19 +246,16 @@ def read_transform(prim: Usd.Prim, *, local: bool = False) -> Transform:
         values = {op.GetOpName(): value for op in ops if (value := op.Get()) is not None}
         turn = values.get("xformOp:orient", Gf.Quatd(1))
         turn = turn if isinstance(turn, Gf.Quatd) else Gf.Quatd(turn).GetNormalized()
-        p, scale = (
-            Gf.Vec3d(values.get(f"xformOp:{name}", Gf.Vec3d(default)))
-            for name, default in (("translate", 0), ("scale", 1))
-        )
+        p = Gf.Vec3d(values.get("xformOp:translate", Gf.Vec3d(0)))
+        scale = Gf.Vec3d(values.get("xformOp:scale", Gf.Vec3d(1)))
         if min(scale) > 0:
             return _vec3(p), _quat(turn), _vec3(scale)
     matrix = xformable.GetLocalTransformation() if local else cache.GetLocalToWorldTransform(prim)
     rows = np.array(matrix)[:3, :3]
     lengths = np.sqrt(np.square(rows).sum(axis=1))
     if not (np.isfinite(np.array(matrix)).all() and lengths.min() > 0):
-        raise InputError(
-            f"{place(prim)}: its transform flattens it or is not finite; a source needs its size"
-        )
+        text = "its transform flattens it or is not finite; a source needs its size"
+        raise InputError(f"{place(prim)}: {text}")
     rows = rows / lengths[:, None]
     if np.abs(rows @ rows.T - np.eye(3)).max() > SQUARE:
         raise InputError(
@@ -273,10 +263,8 @@ def read_transform(prim: Usd.Prim, *, local: bool = False) -> Transform:
             "the transform into a mesh"
         )
     if np.linalg.det(rows) < 0:
-        raise InputError(
-            f"{place(prim)}: it is mirrored by a negative scale, so its magnetization is ambiguous; turn it "
-            "instead"
-        )
+        text = "it is mirrored by a negative scale, so its magnetization is ambiguous; turn it instead"
+        raise InputError(f"{place(prim)}: {text}")
     turned = Gf.Matrix4d(1)
     turned.SetRotateOnly(Gf.Matrix3d(*rows.ravel().tolist()))
     x, y, z = matrix.ExtractTranslation()

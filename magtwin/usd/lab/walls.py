@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, about
 from magtwin.frames import IDENTITY_XYZW, quat_from_yaw, yaw_from_quat
 from magtwin.spec.base import Quat, Vec3
 from magtwin.spec.furniture import Part
@@ -109,10 +109,8 @@ def read_lab(lab: Usd.Prim) -> LabSpec:
     read, room = read_walls(lab), _read_room(lab)
     if not (read.walls or read.doors or read.windows):
         return room
-    try:
+    with about(f"{place(lab)}:"):
         return replace(room, walls=read.walls, doors=read.doors, windows=read.windows)
-    except InputError as error:
-        raise InputError(f"{place(lab)}: {error}") from error
 
 
 def _read_room(lab: Usd.Prim) -> LabSpec:
@@ -144,24 +142,18 @@ def read_walls(lab: Usd.Prim) -> ReadWalls:
         openings = [_read_opening(each, wall) for each in own]
         mine = [s for s in steel if s.GetPath().HasPrefix(path)]
         wanted = {s.name: s for s in sources_of_wall(wall, openings, in_world=False)}
-        found = {_steel_name(s, path): read_source(s, local=True) for s in mine}
+        names = [s.GetPath().MakeRelativePath(path).pathString.replace("/", "_") for s in mine]
+        found = {name: read_source(s, local=True) for name, s in zip(names, mine, strict=True)}
         if found == {name: replace(s, name=found[name].name) for name, s in wanted.items() if name in found}:
             taken |= {s.GetPath() for s in mine}
         else:
-            wall = replace(wall, magnetization=0.0, susceptibility=0.0)
-            openings = [
-                replace(each, magnetization=0.0, susceptibility=0.0) if isinstance(each, Door) else each
-                for each in openings
-            ]
+            none = {"magnetization": 0.0, "susceptibility": 0.0}
+            wall = replace(wall, **none)  # type: ignore[arg-type]
+            openings = [replace(o, **none) if isinstance(o, Door) else o for o in openings]  # type: ignore[arg-type]
         walls += [wall] if has_api(prim, "wall") else []
         doors += [each for each in openings if isinstance(each, Door)]
         windows += [each for each in openings if isinstance(each, Window)]
     return ReadWalls(tuple(walls), tuple(doors), tuple(windows), frozenset(taken))
-
-
-def _steel_name(prim: Usd.Prim, wall: Sdf.Path) -> str:
-    """Name of a steel part below a wall, as `sources_of_wall` has it."""
-    return prim.GetPath().MakeRelativePath(wall).pathString.replace("/", "_")
 
 
 def _read_wall(prim: Usd.Prim) -> Wall:

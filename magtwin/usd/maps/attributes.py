@@ -57,18 +57,15 @@ def read_height(prim: Usd.Prim) -> float | None:
     if height is None:
         return None
     if not isinstance(height, float) or not math.isfinite(height):
-        raise InputError(
-            f"{attribute.GetName()} must be a length [m], got {height!r}; clear it where unknown"
-        )
+        text = f"must be a length [m], got {height!r}; clear it where unknown"
+        raise InputError(f"{attribute.GetName()} {text}")
     return height
 
 
 def read_parameters(text: str) -> dict[str, Any]:
     """Parameters from their JSON; empty if there is none."""
-    name, got = (
-        attribute_name("anomalyMap", "parameters"),
-        f"got {text[:MOST_CHARACTERS]!r}; make the map anew",
-    )
+    name = attribute_name("anomalyMap", "parameters")
+    got = f"got {text[:MOST_CHARACTERS]!r}; make the map anew"
     try:
         figures = json.loads(text or "{}")
         json.dumps(figures, allow_nan=False)  # refuses NaN, and 1e999, which is infinite
@@ -167,17 +164,15 @@ def harmonic_arrays(field: AnomalyMap) -> dict[str, NDArray] | None:
 
 def harmonic_values(harmonic: Mapping[str, NDArray] | None) -> dict[str, Any]:
     """Values of the attributes of a harmonic field, by name; None if there is none."""
-    return {
-        attribute_name("harmonic", name): _usd_array(harmonic[name], shape) if harmonic else None
-        for name, shape in HARMONIC.items()
-    }
-
-
-def _usd_array(array: NDArray, shape: tuple[int, ...]) -> Any:
-    """An array of a harmonic field as the type of its attribute; -1 in `shape` is any number of rows."""
-    if shape in ((3, 3), (3,)):
-        return (Gf.Matrix3d if len(shape) == 2 else Gf.Vec3d)(*array.ravel().tolist())
-    return Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(array))
+    values: dict[str, Any] = {}
+    for name, shape in HARMONIC.items():
+        value: Any = harmonic[name] if harmonic else None
+        if value is not None and -1 in shape:  # any number of rows
+            value = Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(value))
+        elif value is not None:
+            value = (Gf.Matrix3d if len(shape) == 2 else Gf.Vec3d)(*value.ravel().tolist())
+        values[attribute_name("harmonic", name)] = value
+    return values
 
 
 def grid_numbers(grid: Grid) -> NDArray[np.float64]:

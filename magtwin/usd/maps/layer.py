@@ -4,7 +4,6 @@ import hashlib
 import math
 import os
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Usd, UsdGeom, Vt
 
-from magtwin.errors import InputError
+from magtwin.errors import InputError, about
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.usd.layers import new_stage, open_stage, translates
@@ -74,10 +73,8 @@ def _refuse_tables(path: str | os.PathLike[str]) -> None:
     """Refuse a table of readings or a recording in place of a map."""
     if Path(path).suffix.lower() in (".csv", ".txt", ".parquet", ".pq", ".mcap", ".db3"):
         fitted = Path(path).with_suffix(".usdc").name
-        raise InputError(
-            f"{path}: a table of readings or a recording, not a map; fit a map to it first: "
-            f"magtwin map fit {quote(str(path))} --out {fitted}"
-        )
+        way = f"fit a map to it first: magtwin map fit {quote(str(path))} --out {fitted}"
+        raise InputError(f"{path}: a table of readings or a recording, not a map; {way}")
 
 
 @translates
@@ -119,10 +116,8 @@ def layer_of_map(path: str | os.PathLike[str]) -> Path | None:
 def check_map_layer(path: str | os.PathLike[str]) -> None:
     """Refuse a file that is no map layer, as `map_layer`; errors as for `is_map_layer`."""
     if not is_map_layer(path):
-        raise InputError(
-            f"{path}: is no map layer; give the layer of a map, such as `magtwin map import` writes",
-            parameter="map_layer",
-        )
+        text = "is no map layer; give the layer of a map, such as `magtwin map import` writes"
+        raise InputError(f"{path}: {text}", parameter="map_layer")
 
 
 def _arrays(prim: Usd.Prim) -> tuple[NDArray, NDArray, NDArray, dict[str, NDArray] | None, NDArray]:
@@ -155,9 +150,8 @@ def read_map(prim: Usd.Prim) -> AnomalyMap:
         )
     shape = tuple(get(prim, "shape"))
     if len(shape) != 3 or min(shape) < 1 or not values.size == valid.size == math.prod(shape):
-        raise InputError(
-            f"{place(prim)}: shape {list(shape)} does not fit {values.size} values and {valid.size} flags"
-        )
+        sizes = f"{values.size} values and {valid.size} flags"
+        raise InputError(f"{place(prim)}: shape {list(shape)} does not fit {sizes}")
     if variance.size not in (0, values.size, 3 * values.size):
         raise InputError(f"{place(prim)}: {values.size} values have {variance.size} variances")
     headings = np.array(get(prim, "headings"), float)
@@ -167,18 +161,14 @@ def read_map(prim: Usd.Prim) -> AnomalyMap:
             f"{str(headings.tolist())[:MOST_CHARACTERS]}; make the map anew"
         )
     if checksum != _checksum(values, valid, variance, harmonic, grid):
-        raise InputError(
-            f"{place(prim)}: the map's values do not match its checksum, which covers its grid too; make the "
-            "map anew"
-        )
+        text = "the map's values do not match its checksum, which covers its grid too; make the map anew"
+        raise InputError(f"{place(prim)}: {text}")
     spreads = variance.reshape(-1, *shape).astype(float)  # of the nodes, and between them
     recorded = _read_recorded(prim, RECORDED[0], shape)
     if recorded is not None and not np.array_equal(recorded.ravel().astype("f4"), values, equal_nan=True):
-        raise InputError(
-            f"{place(prim)}: the map's values are not those that were recorded, in single precision; make "
-            "the map anew"
-        )
-    try:
+        text = "the map's values are not those that were recorded, in single precision; make the map anew"
+        raise InputError(f"{place(prim)}: {text}")
+    with about(f"{place(prim)}:"):
         return AnomalyMap(
             values_nt=values.reshape(shape).astype(float) if recorded is None else recorded,
             valid=valid.reshape(shape).astype(bool),
@@ -195,8 +185,6 @@ def read_map(prim: Usd.Prim) -> AnomalyMap:
             **{name: get(prim, name) for name in PLACES},
             **{name: get(prim, name) for name in TEXTS},
         )
-    except InputError as error:
-        raise InputError(f"{place(prim)}: {error}") from error
 
 
 def _read_recorded(prim: Usd.Prim, name: str, shape: tuple[int, ...]) -> NDArray | None:
@@ -238,13 +226,7 @@ def _values(field: AnomalyMap) -> dict[str, Any]:
     return {**named, **texts_of(field), **harmonic_values(harmonic)}
 
 
-def _checksum(
-    values: NDArray,
-    valid: NDArray,
-    variance: NDArray,
-    harmonic: Mapping[str, NDArray] | None,
-    grid: NDArray,
-) -> str:
+def _checksum(values: NDArray, valid: NDArray, variance: NDArray, harmonic: Any, grid: NDArray) -> str:
     """SHA-256 over the bytes of the arrays: float32, one byte a flag, float64; little-endian."""
     digest = hashlib.sha256(values.astype("<f4").tobytes())
     digest.update(valid.astype(np.uint8).tobytes())

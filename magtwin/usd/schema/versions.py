@@ -33,21 +33,17 @@ def version_of(layer: Sdf.Layer) -> tuple[int, int] | None:
     Raises:
         InputError: It is not a version, or its first number is above that of this magtwin.
     """
-    text = layer.customLayerData.get(KEY)
+    text, where = layer.customLayerData.get(KEY), layer.realPath or layer.identifier
     if text is None:
         return None
     version = re.fullmatch(r"([0-9]{1,9})\.([0-9]{1,9})", str(text))
     if version is None:
-        raise InputError(
-            f"{layer.realPath or layer.identifier}: customLayerData {KEY} must be a version such as "
-            f"{TEXT!r}, got {text!r}"
-        )
+        wanted = f"must be a version such as {TEXT!r}, got {text!r}"
+        raise InputError(f"{where}: customLayerData {KEY} {wanted}")
     first, second = map(int, version.groups())
     if first > VERSION[0]:
-        raise InputError(
-            f"{layer.realPath or layer.identifier}: is of schema {text}, this magtwin knows {TEXT}; read it "
-            "with a later magtwin"
-        )
+        said = f"is of schema {text}, this magtwin knows {TEXT}; read it with a later magtwin"
+        raise InputError(f"{where}: {said}")
     return first, second
 
 
