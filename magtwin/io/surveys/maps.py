@@ -188,13 +188,12 @@ def _doubts(readings: Readings) -> list[str]:
 def _masked(field: AnomalyMap) -> list[str]:
     """The doubt about a map that has hardly a node."""
     count, size = int(np.count_nonzero(~field.valid)), field.valid.size
-    if count <= MOST_MASKED * size:
-        return []
-    return [
+    doubt = (
         f"{count:,} of {size:,} nodes are masked: they are far from the readings, or the fit's standard "
         "deviation there is over half that of the readings; check headings and vectors, or take another "
         "--method"
-    ]
+    )
+    return [doubt] if count > MOST_MASKED * size else []
 
 
 def _with_doubts(report: Report, doubts: list[str]) -> Report:
@@ -240,10 +239,8 @@ def _method_options(
 ) -> dict[str, dict[str, Any]]:
     """Options by method; an option of a method that is not used is refused."""
     options: dict[str, dict[str, Any]] = {"auto": {}}
-    for name, option, value, method in (
-        ("kernel", "kernel", kernel, "gp"),
-        ("earth", "earth_nt", earth_nt, "harmonic"),
-    ):
+    given = {("kernel", "kernel", "gp"): kernel, ("earth", "earth_nt", "harmonic"): earth_nt}
+    for (name, option, method), value in given.items():
         if value is None:
             continue
         if not {method, "auto"} & set(methods):
