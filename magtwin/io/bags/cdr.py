@@ -137,7 +137,7 @@ def decode(leaves: Sequence[Leaf], messages: Messages, wanted: Iterable[str]) ->
     [ns]; strings a list of M, and sequences of strings of M tuples. A message that is too short for its type,
     or has another encoding, is refused.
     """
-    left, values_of = set(wanted), {}
+    left, values_of = set(wanted), dict[str, Any]()
     head = 0 if messages.packed else HEADER
     raw = _Raw(messages.buffer, messages.start + head, messages.size - head, messages.packed)
     if np.any(raw.room < 0):
@@ -241,9 +241,8 @@ def _texts(leaf: Leaf, raw: _Raw, at: Index, wanted: bool) -> tuple[list[Any], I
         some = raw.rows(rows)
         begins, after = _text(leaf, some, at[rows])
         if wanted:
-            for row, word in zip(
-                rows, _strings(raw.buffer, some.body + begins, some.body + after), strict=True
-            ):
+            found = _strings(raw.buffer, some.body + begins, some.body + after)
+            for row, word in zip(rows, found, strict=True):
                 words[row].append(word)
         at = at.copy()
         at[rows] = after

@@ -62,9 +62,8 @@ class Db3Reader:
     def messages(self, ids: Collection[int], most: int | None = None) -> dict[int, Messages]:
         """The messages of some topics in the order of receipt; of about the first `most` bytes."""
         found = {number: (array("q"), array("q"), bytearray()) for number in ids}
-        query = (
-            f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({', '.join('?' * len(ids))})"
-        )
+        marks = ", ".join("?" * len(ids))
+        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks})"
         held = self._steps = 0
         for number, received, data in self._database.execute(query, list(ids)):
             times, sizes, contents = found[number]

@@ -183,9 +183,8 @@ class Stream:
                 entry["first"] = first
                 first += shape[0] if shape else 1
             columns.append(entry)
-        table = {"unit": self._sender.unit, "columns": columns} | (
-            {"facts": dict(metadata)} if metadata else {}
-        )
+        table = {"unit": self._sender.unit, "columns": columns}
+        table |= {"facts": dict(metadata)} if metadata else {}
         return json.dumps(table, ensure_ascii=False, indent=1)
 
 
@@ -195,10 +194,8 @@ def _later_s(run: Run) -> float:
     if not -np.inf < begin < 0:
         return 0.0
     later = float(-np.floor(begin))
-    text = (
-        f"t begins at {begin:.9g} s, and stamps of ROS at 0: they are t + {later:g} s; magtwin reads t back"
-    )
-    warnings.warn(text, RepairWarning, stacklevel=4)
+    text = f"stamps of ROS at 0: they are t + {later:g} s; magtwin reads t back"
+    warnings.warn(f"t begins at {begin:.9g} s, and {text}", RepairWarning, stacklevel=4)
     return later
 
 
@@ -213,9 +210,7 @@ def _alike(run: Columns, flags: Iterable[str], rows: NDArray[np.intp]) -> list[N
 
 def _finite(run: Columns, names: Iterable[str]) -> NDArray[np.bool_]:
     """Rows in which some columns are finite."""
-    return np.asarray(
-        np.logical_and.reduce([np.isfinite(run[n]).reshape(len(run[n]), -1).all(1) for n in names])
-    )
+    return np.all([np.isfinite(run[n]).reshape(len(run[n]), -1).all(axis=1) for n in names], axis=0)
 
 
 def _differ(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:

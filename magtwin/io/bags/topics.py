@@ -303,9 +303,8 @@ def _of_array(columns: dict[str, Array]) -> dict[str, Array]:
     """Vectors of three numbers, or magnitudes, of messages that hold any number of numbers."""
     for name, values in columns.items():
         if values.shape[1] not in (1, 3):
-            raise InputError(
-                f"its {name} has {values.shape[1]} numbers; a magnitude is one, a vector x, y, z"
-            )
+            count = values.shape[1]
+            raise InputError(f"its {name} has {count} numbers; a magnitude is one, a vector x, y, z")
     return {name: values if values.shape[1] == 3 else values[:, 0] for name, values in columns.items()}
 
 

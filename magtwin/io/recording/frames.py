@@ -61,9 +61,8 @@ class Mount(NamedTuple):
         place = ", ".join(f"{part + 0:.3g}" for part in np.round(self.p, 4))
         cosine = (np.trace(matrix_from_quat(self.q_xyzw)) - 1) / 2
         turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-        return (
-            f"{self.name!r:.40} to {self.base!r:.40}, which has it at ({place}) m, turned by {turn:.3g} deg"
-        )
+        where = f"at ({place}) m, turned by {turn:.3g} deg"
+        return f"{self.name!r:.40} to {self.base!r:.40}, which has it {where}"
 
 
 @dataclass
@@ -154,10 +153,7 @@ def mount_of(role: Role, frames: Frames, known: StaticFrames) -> tuple[Mount | N
         return None, ""
     mount = known.mount(part)
     if mount is None and kind_of(part) == "part":
-        return (
-            None,
-            f"it is the pose of {part!r:.40}, and no tree of frames has the way from base_link to there",
-        )
+        return None, f"it is the pose of {part!r:.40}, and no tree of frames leads from base_link to there"
     return mount, ""
 
 
@@ -205,10 +201,9 @@ def frames_of(leaves: Iterable[Leaf], messages: Messages) -> Frames:
     each = [sorted({plain(name) for name in names.get(leaf, ())} - {""}) for leaf in LEAVES]
     for several in each:
         if len(several) > 1:
-            raise InputError(
-                f"its messages are in several frames, {', '.join(several)[:200]}; record one topic each"
-            )
-    return each[0][0] if each[0] else "", each[1][0] if each[1] else ""
+            listed = ", ".join(several)[:200]
+            raise InputError(f"its messages are in several frames, {listed}; record one topic each")
+    return "".join(each[0]), "".join(each[1])
 
 
 class Transform(NamedTuple):

@@ -127,9 +127,8 @@ def candidates(role: Topic, bag: "Bag", taken: Collection[str] = ()) -> list[str
     sought = ROLES[role]
     names = [name for name in bag.kinds if name not in taken and not _has(name, sought.never)]
     alone = [name for name in names if bag.kinds[name] in sought.kinds]
-    named = [
-        name for name in names if name not in alone and _has(name, sought.named) and can_be(role, bag, name)
-    ]
+    named = [name for name in names if name not in alone and _has(name, sought.named)]
+    named = [name for name in named if can_be(role, bag, name)]
     return alone + named if role is POSE else alone or named
 
 
@@ -167,16 +166,12 @@ def reads_of(role: Topic, bag: "Bag", name: str) -> Topic:
         return role
     leaves = {leaf.name: leaf for leaf in bag.layout(name) if leaf.kind in NUMBERS}
     threes = [leaf for leaf in leaves if leaves[leaf].count == 3]
-    axes = [
-        tuple(leaf[:-1] + axis for axis in "xyz")
-        for leaf in leaves
-        if leaf == "x" or leaf.endswith((".x", "_x"))
-    ]
+    begins = [leaf[:-1] for leaf in leaves if leaf == "x" or leaf.endswith((".x", "_x"))]
+    axes = [(begin + "x", begin + "y", begin + "z") for begin in begins]
     axes = [three for three in axes if leaves.keys() >= set(three)]
-    single = [leaf for leaf in leaves if leaves[leaf].count == 1]
     found = _best(threes) or (axes[0] if len(axes) == 1 else None)
     if found is None and role is MAGNITUDE:
-        found = _best(single)
+        found = _best([leaf for leaf in leaves if leaves[leaf].count == 1])
     if found is None:
         return role
     return replace(role, reads={**role.reads, kind: {"magnetic_field": found}})
@@ -200,6 +195,5 @@ def check_kind(role: Topic, bag: "Bag", name: str) -> None:
         raise bag.missing(name)
     if not can_be(role, bag, name):
         fit = " or ".join(role.reads)
-        raise InputError(
-            f"{bag.path}: topic {name} is a {bag.kinds[name] or 'message without a type'}; it must be {fit}"
-        )
+        kind = bag.kinds[name] or "message without a type"
+        raise InputError(f"{bag.path}: topic {name} is a {kind}; it must be {fit}")

@@ -13,18 +13,18 @@ from rerun.chunk import RrdReader
 from magtwin.errors import InputError
 from magtwin.files.file import existing
 from magtwin.files.outputs import output
-from magtwin.io.rerun.layout import RUN_COLOURS, Shown, comparison_layout, plotted
+from magtwin.io.rerun.layout import RUN_COLOURS, Shown, comparison_layout, plotted, raised
 from magtwin.io.rerun.recording import (
     ROOM,
-    Recording,
     content_id,
     flush,
     recording_of,
+    send_whole,
     size_of,
     stream,
     title_of,
 )
-from magtwin.io.rerun.series import COLUMNS_ENTITY, STATES, entity_of, table_of
+from magtwin.io.rerun.series import COLUMNS_ENTITY, entity_of, table_of
 from magtwin.io.rerun.viewer import check_decodes, show
 from magtwin.io.rerun.world import Interior, Robot, heading_of, send_room
 from magtwin.path import Path
@@ -69,14 +69,12 @@ def write_rrd(
     shown: dict[str, Any] = {"planned": planned, "scans": scans}
     if run.rows > mapped.LONG:  # the layout looks at some rows, and at the last one
         some = np.append(np.arange(0, run.rows - 1, -(-run.rows // mapped.BLOCK)), run.rows - 1)
-        events = [key for key in STATES if key in run and run[key].any()]
-        shown |= {"known": run.take(some), "events": events}
+        shown |= {"known": run.take(some), "events": raised(run)}
         mapped.release()
+    shown |= {"room": size, "final": FilePath(path)}
     with (
         output(path, force=force) as aside,
-        recording_of(
-            run, content_id(run), name, twin, **shown, room=size, file=aside, final=FilePath(path)
-        ) as recording,
+        recording_of(run, content_id(run), name, twin, file=aside, **shown) as recording,
     ):
         for block in blocks(run):
             recording.append(block)
@@ -121,9 +119,7 @@ def write_comparison(
             send_room(rec, interior, twin.field, first, planned)
         for shown in compared:
             robot = None if twin is None else Robot(rec, interior, colour=shown.colour, name=shown.name)
-            recording = Recording(rec, shown.name, robot=robot)
-            recording.append(runs[shown.name])
-            recording.close()
+            send_whole(rec, runs[shown.name], shown.name, robot)
 
 
 def show_run(run: Run, twin: Twin | None = None, *, file: str | os.PathLike[str]) -> None:
@@ -163,13 +159,11 @@ def read_runs(path: str | os.PathLike[str]) -> dict[str, Run]:
                 chunks.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
         except (RuntimeError, ValueError, OSError) as error:
             reason = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {path}: ")
-            raise InputError(
-                f"{path}: not a Rerun recording that can be read ({reason}); write it again"
-            ) from error
+            text = f"not a Rerun recording that can be read ({reason}); write it again"
+            raise InputError(f"{path}: {text}") from error
     if not chunks:
-        raise InputError(
-            f"{path}: a Rerun recording without a run of magtwin's: the entity /{COLUMNS_ENTITY} is missing"
-        )
+        text = f"a Rerun recording without a run of magtwin's: the entity /{COLUMNS_ENTITY} is missing"
+        raise InputError(f"{path}: {text}")
     runs = {}
     for batches in chunks.values():
         name, run, rows = table_of(batches, str(path))

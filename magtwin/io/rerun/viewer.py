@@ -102,22 +102,18 @@ def _draw(
     _wait_until(lambda: not client.get_state().loading, f"{source}: the viewer did not load it")
     _show_frames(client, NOTHING_S, lambda: _timelines(client) != [])
     if not _timelines(client):
-        raise InputError(
-            f"{source}: holds nothing that the viewer shows; if the recording was cut short, write it again"
-        )
+        text = "holds nothing that the viewer shows; if the recording was cut short, write it again"
+        raise InputError(f"{source}: {text}")
     if time_s is not None:
         timelines = _timelines(client)
         line = next((timeline for timeline in timelines if timeline.name == TIMELINE), None)
         if line is None or line.start is None or line.end is None:
-            raise InputError(
-                f"{source}: has no timeline {TIMELINE!r} to find a time on; it has "
-                f"{', '.join(timeline.name for timeline in timelines)}"
-            )
+            names = ", ".join(timeline.name for timeline in timelines)
+            raise InputError(f"{source}: has no timeline {TIMELINE!r} to find a time on; it has {names}")
         first, last = line.start / 1e9, line.end / 1e9
         if not first <= time_s <= last:
-            raise InputError(
-                f"{source}: the recording goes from {first:g} to {last:g} s; there is no {time_s:g} s in it"
-            )
+            span = f"the recording goes from {first:g} to {last:g} s"
+            raise InputError(f"{source}: {span}; there is no {time_s:g} s in it")
         client.set_time(TIMELINE, duration=time_s, play_state="paused")
     client.run_command("ui.toggle_top_panel")
     _show_frames(client, TOASTS_S)

@@ -63,8 +63,8 @@ def table_of_log(path: Path, waypoints: Path | None = None, step_m: float | None
     A log is a table; a folder or a zip of tables, as phyphox and Sensor Logger write them; a trace of an
     Android phone; or a log of a vehicle: PX4 (.ulg), ArduPilot (.bin) or HDF5.
     """
-    parts = _parts(path) if is_log(path) else {path.stem: read_table(path)}
-    name, field = _field(path, parts) if is_log(path) else (path.stem, parts[path.stem])
+    parts = _parts(path) if (log := is_log(path)) else {path.stem: read_table(path)}
+    name, field = _field(path, parts) if log else (path.stem, parts[path.stem])
     marks = marks_of(read_table(waypoints), timed=False) if waypoints else _marks(parts, name)
     if waypoints and marks is None:
         raise InputError(
