@@ -53,13 +53,11 @@ class Format:
     given, and options, which other formats refuse."""
 
 
-_TABLES, _RERUN = "magtwin.io.tables", "magtwin.io.rerun.file"
+_IN, _RERUN = "magtwin.io.tables", "magtwin.io.rerun.file"
 _NAMED = frozenset(("columns",))
-PARQUET = Format(
-    name="Parquet", read=f"{_TABLES}:read_parquet", write=f"{_TABLES}:write_parquet", reads=_NAMED
-)
-CSV = Format(name="CSV", read=f"{_TABLES}:read_csv", write=f"{_TABLES}:write_csv", reads=_NAMED)
-NPZ = Format(name="npz", read=f"{_TABLES}:read_npz", write=f"{_TABLES}:write_npz")
+PARQUET = Format(name="Parquet", read=f"{_IN}:read_parquet", write=f"{_IN}:write_parquet", reads=_NAMED)
+CSV = Format(name="CSV", read=f"{_IN}:read_csv", write=f"{_IN}:write_csv", reads=_NAMED)
+NPZ = Format(name="npz", read=f"{_IN}:read_npz", write=f"{_IN}:write_npz")
 _SHOWN = frozenset(("twin", "planned", "scans"))
 RERUN = Format(name="Rerun", read=f"{_RERUN}:read_run", write=f"{_RERUN}:write_rrd", takes=_SHOWN)
 RELEASE = Format(name="released package", read="magtwin.io.release:read_release")
@@ -89,9 +87,8 @@ BAGS = (".mcap", ".db3", ".bag")  # Suffixes of storage files of bags
 _SUFFIXES = {".parquet": "PARQUET", ".csv": "CSV", ".npz": "NPZ", ".rrd": "RERUN", ".json": "RELEASE"}
 _SUFFIXES |= {".mcap": "BAG", ".db3": "DB3", ".bag": "ROS1", ".usd": "USD", ".usda": "USD", ".usdc": "USD"}
 
-FORMATS: Registry[Format] = Registry(
-    "run format", "formats", {suffix: f"{__name__}:{name}" for suffix, name in _SUFFIXES.items()}
-)
+_NAMES = {suffix: f"{__name__}:{name}" for suffix, name in _SUFFIXES.items()}
+FORMATS: Registry[Format] = Registry("run format", "formats", _NAMES)
 """Formats by suffix. A name without a suffix is a rosbag2 folder."""
 
 
@@ -173,8 +170,7 @@ def write_run(
             f"{path}: {format_.name} names the scene's file, and this scene has none; author it with "
             "magtwin.author.scene.author_scene and open that, or leave out twin"
         )
-    scene_file = None if twin is None else twin.scene_file
-    known = {"twin": twin, "planned": planned, "scans": scans, "scene_file": scene_file}
+    known = {"twin": twin, "planned": planned, "scans": scans, "scene_file": twin and twin.scene_file}
     given = {name: value for name, value in known.items() if name in format_.takes}
     _function(format_.write)(run, path, force=force, **given, **options)
 
@@ -224,16 +220,10 @@ def runs_in(path: Path) -> list[Path]:
         return inside
     parts = any(next(path.glob(one), None) for one in ("*.db3", "part-*.parquet"))
     inside = [] if parts or kind_of(path) else sorted(path.glob("[!.]*"))
-    return [
-        file
-        for file in inside
-        if _holds_one(file) or (file.suffix.lower() in FORMATS and ".scans." not in file.name)
-    ] or [path]
-
-
-def _holds_one(folder: Path) -> bool:
-    """Whether a folder holds one run."""
-    return (folder / "metadata.yaml").is_file() or (folder / "run.parquet").is_file()
+    runs = [file for file in inside if file.suffix.lower() in FORMATS and ".scans." not in file.name]
+    known = ("metadata.yaml", "run.parquet")
+    runs += [folder for folder in inside if any((folder / name).is_file() for name in known)]
+    return sorted({*runs}) or [path]
 
 
 def is_bag(path: Path) -> bool:

@@ -148,8 +148,7 @@ class Outputs:
             format_to_write(file)
         tables = tuple(_scans_of(file) for file in files if scans and file.suffix.lower() == ".parquet")
         made = cls(folders[0] if folders else None, files, tables, **options)
-        targets = made.targets
-        if len({target.resolve() for target in targets}) < len(targets):
+        if len({target.resolve() for target in made.targets}) < len(made.targets):
             raise InputError("two outputs have one name; give each its own")
         for name, value, takes in (("out_unit", made.out_unit, "units"), ("usd_fps", made.usd_fps, "fps")):
             if value is not None and not any(takes in format_of(file).takes for file in files):
@@ -193,12 +192,8 @@ class Outputs:
             if self.folder is not None:
                 places[self.folder].mkdir()
             try:
-                yield replace(
-                    self,
-                    folder=places[self.folder] if self.folder is not None else None,
-                    files=tuple(places[file] for file in self.files),
-                    scans=tuple(places[file] for file in self.scans),
-                )
+                files, scans = (tuple(map(places.__getitem__, some)) for some in (self.files, self.scans))
+                yield replace(self, folder=self.folder and places[self.folder], files=files, scans=scans)
             except InputError as error:
                 text = str(error)
                 for target, place in places.items():
@@ -234,11 +229,11 @@ class Outputs:
                 shutil.copyfile(written[target.suffix.lower()], target)
                 continue
             written[target.suffix.lower()] = target
-            takes, options = format_of(target).takes, dict[str, Any]()
-            if self.out_unit is not None and "units" in takes:
-                options["units"] = self.out_unit
-            if self.usd_fps is not None and "fps" in takes:
-                options["fps"] = self.usd_fps or None
+            takes = format_of(target).takes
+            options: dict[str, Any] = {"units": self.out_unit, "fps": self.usd_fps}
+            options = {
+                name: value or None for name, value in options.items() if value is not None and name in takes
+            }
             options |= {"planned": driven.planned, "scans": driven.scans, "force": self.force}
             write_run(driven.run, target, driven.twin, **options)
         if driven.scans is not None:

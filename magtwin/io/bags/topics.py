@@ -282,10 +282,6 @@ def _of_frd(columns: dict[str, Array]) -> dict[str, Array]:
     return {name: values * (1.0, -1.0, -1.0) for name, values in columns.items()}
 
 
-def _of_px4_imu(columns: dict[str, Array]) -> dict[str, Array]:
-    return _of_frd(columns) | {"imu_q_xyzw": np.zeros((len(columns["imu_w"]), 4))}
-
-
 def _of_ned(columns: dict[str, Array], name: str = "odom") -> dict[str, Array]:
     """Odometry of PX4, from north-east-down and forward-right-down to ENU and forward-left-up.
 
@@ -312,21 +308,19 @@ _PX4 = "px4_msgs/msg/"
 _FIELD = "sensor_msgs/msg/MagneticField"
 _ARRAYS = {f"std_msgs/msg/Float{size}MultiArray": {"magnetic_field": "data"} for size in (64, 32)}
 
-POSE = Topic(
-    name="/robot/enu/pose",
-    kind="geometry_msgs/msg/PoseStamped",
-    needs=("mocap_p", "mocap_q_xyzw"),
-    carried=True,
-    lost="flag_pose_lost",
-    frame="map_frame",
-    reads={
-        "geometry_msgs/msg/PoseStamped": _pose_at("pose."),
+POSE = _carrier(
+    "geometry_msgs/msg/PoseStamped",
+    _pose_at("pose."),
+    {
         "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_at("pose.pose."),
         "geometry_msgs/msg/TransformStamped": _pose_at("transform.", "translation", "rotation"),
         "nav_msgs/msg/Odometry": _pose_at("pose.pose."),
         _PX4 + "VehicleOdometry": {"mocap_p": "position", "mocap_q_xyzw": "q"},
     },
     turned={_PX4 + "VehicleOdometry": lambda c: _of_ned(c, "mocap")},
+    name="/robot/enu/pose",
+    lost="flag_pose_lost",
+    frame="map_frame",
 )
 ODOMETRY = _carrier(
     "nav_msgs/msg/Odometry",
@@ -353,7 +347,7 @@ IMU = _carrier(
     "sensor_msgs/msg/Imu",
     {"imu_q_xyzw": "orientation", "imu_w": "angular_velocity", "imu_a": "linear_acceleration"},
     {_PX4 + "SensorCombined": {"imu_w": "gyro_rad", "imu_a": "accelerometer_m_s2"}},
-    turned={_PX4 + "SensorCombined": _of_px4_imu},
+    turned={_PX4 + "SensorCombined": lambda c: _of_frd(c) | {"imu_q_xyzw": np.zeros((len(c["imu_w"]), 4))}},
     name="/robot/imu",
     frame="imu_frame",
     more=_imu,

@@ -247,8 +247,7 @@ class Flags:
                 continue
             flag = run[column]
             before = self._before.get(column)
-            first = flag[0] != before  # the first row always is a change
-            rows = np.flatnonzero(np.append(first, flag[1:] != flag[:-1]))
+            rows = np.flatnonzero(np.append(flag[0] != before, flag[1:] != flag[:-1]))  # the first one always
             if before is None and not self.name:
                 values = [state.down, state.up]
                 style = rr.StateConfiguration(values=values, colors=[(70, 70, 76), (255, 158, 64)])
@@ -256,8 +255,7 @@ class Flags:
             self._before[column] = bool(flag[-1])
             if not self.name:
                 words = np.where(flag[rows], state.up, state.down).tolist()
-                t = run["t"][rows]
-                send(self.rec, f"states/{state.name}", t, rr.StateChange, state=words)
+                send(self.rec, f"states/{state.name}", run["t"][rows], rr.StateChange, state=words)
             if column in self._open or flag.any():
                 events += self._episodes(column, run)
         self._send(events)
@@ -273,18 +271,16 @@ class Flags:
             since = float(t[first])
             if column in self._open and since - self._open[column][1] > GAP_S:
                 yield self._end(column)
-            if column in self._open:
-                since = self._open[column][0]
-            else:
+            if column not in self._open:
                 yield since, STATES[column].level, f"{STATES[column].begins}{_place(run, first)}"
+            since = self._open[column][0] if column in self._open else since
             self._open[column] = since, float(t[last]), _place(run, last)
         if column in self._open and t[-1] - self._open[column][1] > GAP_S:
             yield self._end(column)
 
     def _end(self, column: str) -> tuple[float, str, str]:
         since, until, place = self._open.pop(column)
-        text = f"{STATES[column].ends}{place}, after {until - since:.2f} s"
-        return until, "INFO", text
+        return until, "INFO", f"{STATES[column].ends}{place}, after {until - since:.2f} s"
 
     def _send(self, events: list[tuple[float, str, str]]) -> None:
         if not events:
@@ -292,8 +288,7 @@ class Flags:
         events.sort(key=lambda event: event[0])
         t, levels, texts = zip(*events, strict=True)
         named = [f"{self.name}: {text}" for text in texts] if self.name else list(texts)
-        at = np.array(t)
-        send(self.rec, "events", at, rr.TextLog, text=named, level=list(levels))
+        send(self.rec, "events", np.array(t), rr.TextLog, text=named, level=list(levels))
 
 
 def _place(run: Run, row: np.intp) -> str:
