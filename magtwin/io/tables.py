@@ -152,10 +152,8 @@ class ParquetParts:
         self.path = check_free(path, force=force)
         self.folder = Path(f"{self.path}.parts")  # Folder of the parts
         if self.folder.exists() and not force:
-            raise InputError(
-                f"{self.folder}: parts of a run that did not end; magtwin convert reads them; give --force "
-                "to replace them, or another name"
-            )
+            advice = "magtwin convert reads them; give --force to replace them, or another name"
+            raise InputError(f"{self.folder}: parts of a run that did not end; {advice}")
         self._count, self._last = 0, -np.inf
         try:
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -169,9 +167,8 @@ class ParquetParts:
             return
         check_clock(run, "the block to append")
         if run["t"][0] <= self._last:
-            raise InputError(
-                f"the block to append begins at {run['t'][0]:.9g} s, and the last ended at {self._last:.9g} s"
-            )
+            begin = f"begins at {run['t'][0]:.9g} s"
+            raise InputError(f"the block to append {begin}, and the last ended at {self._last:.9g} s")
         with output(self.folder / f"part-{self._count:06d}.parquet", at_once=True) as aside:
             _write(run, aside)
         self._count, self._last = self._count + 1, run["t"][-1]
@@ -255,10 +252,8 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
             return _others(path, columns, fault)
         raise fault from error
     if rows not in ("", str(table.num_rows)):
-        raise InputError(
-            f"{path}: holds {table.num_rows} rows, but its line '# rows' says {rows[:20]!r}: cut short, or "
-            "edited; copy it again, or remove that line"
-        )
+        text = f"holds {table.num_rows} rows, but its line '# rows' says {rows[:20]!r}"
+        raise InputError(f"{path}: {text}: cut short, or edited; copy it again, or remove that line")
     fields = [f.with_metadata(said.get(f.name) or None) for f in table.schema]
     table = table.cast(pa.schema(fields, metadata={FACTS: metadata}))
     return run_of(table if said else _by_quantity(table, path), path)
@@ -460,10 +455,8 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
     }
     for name, values in arrays.items():
         if values.dtype.kind not in "bfiu" or values.ndim not in (1, 2):
-            raise InputError(
-                f"{path}: column {name!r} must hold numbers or flags in rows, got {values.dtype} "
-                f"of shape {values.shape}"
-            )
+            got = f"{values.dtype} of shape {values.shape}"
+            raise InputError(f"{path}: column {name!r} must hold numbers or flags in rows, got {got}")
     try:
         run = Run(arrays, metadata, specs)
     except (InputError, TypeError) as error:

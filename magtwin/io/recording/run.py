@@ -340,10 +340,8 @@ class Recording:
         """Warn once of the frames of sensors whose place on the robot is not known."""
         frames = ", ".join(f"{name!r:.40}" for name in self._frameless)
         topics = ", ".join(name for names in self._frameless.values() for name in names)
-        self._warn(
-            f"no /tf, /tf_static or robot_description joins {frames} to base_link: vectors of {topics} are "
-            "taken as in the axes of base_link"
-        )
+        text = f"vectors of {topics} are taken as in the axes of base_link"
+        self._warn(f"no /tf, /tf_static or robot_description joins {frames} to base_link: {text}")
 
     def _signal(self, topic: Topic) -> Signal:
         name, noun = self._topics[topic], ROLES[topic].noun
@@ -377,10 +375,9 @@ class Recording:
         signal, order = signal.in_order(ns, self._bag.path)
         when = (order.ns - self._start) / NS
         if when[-1] < 0 or when[0] > self._t[-1]:
-            raise InputError(
-                f"{self._bag.path}: {signal.name} spans {when[0]:.3f}..{when[-1]:.3f} s since the first of "
-                f"{self._metadata['clock']}, whose last is at {self._t[-1]:.3f} s; are they of one clock?"
-            )
+            span = f"{signal.name} spans {when[0]:.3f}..{when[-1]:.3f} s since the first of"
+            clock = f"{self._metadata['clock']}, whose last is at {self._t[-1]:.3f} s"
+            raise InputError(f"{self._bag.path}: {span} {clock}; are they of one clock?")
         self._order(signal, str(order))
         return signal, when
 
@@ -415,8 +412,7 @@ class Recording:
             self._read.discard(signal.name)
             return {}
         size = np.linalg.norm(b, axis=1)
-        size = size[np.isfinite(size)]
-        if not len(size):
+        if not np.isfinite(size).any():
             return {}
         if self._told and signal.kind == self._bag.kinds[self._topics[MAGNITUDE]]:
             unit, factor = self._metadata["field_unit"], nt_per(self._unit, self._scale)

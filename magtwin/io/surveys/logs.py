@@ -67,9 +67,8 @@ def table_of_log(path: Path, waypoints: Path | None = None, step_m: float | None
     name, field = _field(path, parts) if log else (path.stem, parts[path.stem])
     marks = marks_of(read_table(waypoints), timed=False) if waypoints else _marks(parts, name)
     if waypoints and marks is None:
-        raise InputError(
-            f"{waypoints}: no marks; a row is t,x,y, or t and a note such as 1.5,2, or x,y in order"
-        )
+        text = "a row is t,x,y, or t and a note such as 1.5,2, or x,y in order"
+        raise InputError(f"{waypoints}: no marks; {text}")
     if marks:
         return walked(field, marks, _accelerations(parts), step_m)
     if labels := field.find("x", "y") or field.find("lon", "lat"):

@@ -97,9 +97,8 @@ def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
     """
     field = next((c for c in ("b_measured_nt", "b_total_nt") if c in run and np.isfinite(run[c]).any()), None)
     if field is None:
-        raise InputError(
-            f"{source or 'run'}: b_measured_nt and b_total_nt hold no field, only nan or nothing"
-        )
+        text = "b_measured_nt and b_total_nt hold no field, only nan or nothing"
+        raise InputError(f"{source or 'run'}: {text}")
     b, p, yaw, t = run[field], run["p_world_base"], run["yaw"], run["t"]
     known = np.isfinite(b) & np.isfinite(p).all(axis=1) & np.isfinite(yaw) & np.isfinite(t)
     lost = run["flag_lost_lock"] if "flag_lost_lock" in run else np.zeros(len(b), bool)
@@ -197,11 +196,9 @@ def _beside(first: Path, word: str) -> Path:
 
 def _together(parts: Sequence[Readings]) -> Readings:
     """Several surveys as runs of one."""
-    gridded = [part for part in parts if part.grid is not None]
-    if gridded:
-        raise InputError(
-            f"survey {gridded[0].name!r} is gridded and cannot be one of several sources; read it alone"
-        )
+    if gridded := [part.name for part in parts if part.grid is not None]:
+        text = "is gridded and cannot be one of several sources; read it alone"
+        raise InputError(f"survey {gridded[0]!r} {text}")
     first = np.cumsum([0] + [len(part.runs) for part in parts])
     arrays: dict[str, Any] = {"run": np.concatenate([p.run + n for p, n in zip(parts, first, strict=False)])}
     for key in ("p_xy", "yaw", "b_nt", "b_body_nt", "t", "good"):
