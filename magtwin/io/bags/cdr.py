@@ -80,30 +80,29 @@ def encode(leaves: Sequence[Leaf], fields: Mapping[str, Any], rows: int, *, room
     numbers: list[tuple[int, str, NDArray[Any]]] = []
     texts: list[tuple[int, bytes]] = []
     at = 0
+
+    def put(length: int, content: bytes = b"") -> None:
+        nonlocal at
+        texts.append((_aligned(at, 4), np.uint32(length).tobytes() + content))
+        at = _aligned(at, 4) + 4 + len(content)
+
     for leaf in leaves:
         value = fields.get(leaf.name)
         if leaf.kind == "none":
-            at = _aligned(at, 4) + 4
+            put(0)
             continue
         if leaf.kind == "text":
             words = ("" if value is None else value,) if leaf.count else tuple(value or ())
             if leaf.count is None:
-                at = _aligned(at, 4)
-                texts.append((at, np.uint32(len(words)).tobytes()))
-                at += 4
-            for word in words:
-                encoded = word.encode() + b"\0"
-                at = _aligned(at, 4)
-                texts.append((at, np.uint32(len(encoded)).tobytes() + encoded))
-                at += 4 + len(encoded)
+                put(len(words))
+            for encoded in (word.encode() + b"\0" for word in words):
+                put(len(encoded), encoded)
             continue
         array = np.zeros((1, leaf.count or 0)) if value is None else np.asarray(value)
         count = leaf.count
         if count is None:
             count = array.shape[-1]
-            at = _aligned(at, 4)
-            texts.append((at, np.uint32(count).tobytes()))
-            at += 4
+            put(count)
             if not count:
                 continue
         kind, size = ("u4", 4) if leaf.kind == "time" else (leaf.kind, np.dtype(leaf.kind).itemsize)

@@ -57,14 +57,13 @@ def info_of_bag(path: Path, **reading: Any) -> Report:
 
 def _storage(bag: Bag, times: Mapping[str, Index], size: int) -> list[Figure]:
     """Duration, begin, size and storage."""
-    first = [int(each[0]) for each in times.values() if len(each)]
-    last = [int(each[-1]) for each in times.values() if len(each)]
-    span = (max(last) - min(first)) / NS if first else 0.0
+    ends = [int(each[k]) for each in times.values() if len(each) for k in (0, -1)]
+    span = (max(ends) - min(ends)) / NS if ends else 0.0
     count = sum(map(len, times.values()))
     figures = [Figure("duration", float(f"{span:.6g}"), "s"), Figure("messages", count)]
     figures += [Figure("topics", len(bag.topics)), Figure("size", size, "bytes")]
-    if first:
-        begin = min(first)
+    if ends:
+        begin = min(ends)
         known = 0 <= begin < 253_402_300_800 * NS  # what a calendar holds
         date = f"{datetime.fromtimestamp(begin // NS, UTC):%Y-%m-%d %H:%M:%S} UTC" if known else f"{begin} ns"
         figures.append(Figure("start", date))

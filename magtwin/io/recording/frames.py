@@ -153,7 +153,8 @@ def mount_of(role: Role, frames: Frames, known: StaticFrames) -> tuple[Mount | N
         return None, ""
     mount = known.mount(part)
     if mount is None and kind_of(part) == "part":
-        return None, f"it is the pose of {part!r:.40}, and no tree of frames leads from base_link to there"
+        text = "and no tree of frames has the way from base_link to there"
+        return None, f"it is the pose of {part!r:.40}, {text}"
     return mount, ""
 
 

@@ -14,7 +14,7 @@ from magtwin.files.outputs import output
 from magtwin.frames import wrap_angle
 from magtwin.io.rerun.layout import UP_TO_NOW, bare, plot_view, time_axis
 from magtwin.io.rerun.recording import ROOM, content_id, send_whole, size_of, stream, title_of
-from magtwin.io.rerun.series import TIMELINE, Array, nanoseconds, send
+from magtwin.io.rerun.series import Array, send, send_clouds
 from magtwin.io.rerun.world import UPWARDS, Scale, heading_of, send_map
 from magtwin.run.arrow import without_pandas
 from magtwin.run.run import Run
@@ -166,10 +166,7 @@ def _send_spread(rec: rr.RecordingStream, run: Run, particles: Sequence[Array]) 
         entity = f"{PATHS}/particles"
         look = rr.Points2D.from_fields(radii=[0.009], colors=[PARTICLES], draw_order=1.5)
         rec.log(entity, look, static=True)
-        drawn = [_decimated(cloud) for cloud in particles]
-        columns = rr.Points2D.columns(positions=np.concatenate(drawn).astype(np.float32))
-        times = rr.TimeColumn(TIMELINE, duration=nanoseconds(t))
-        rec.send_columns(entity, [times], columns.partition([len(part) for part in drawn]))
+        send_clouds(rec, entity, t, [_decimated(cloud) for cloud in particles], rr.Points2D)
     known = np.isfinite(covariance).all(axis=1)
     if known.any():
         line = rr.LineStrips2D.from_fields(radii=[0.008], colors=[BAND], draw_order=3.0)

@@ -140,6 +140,13 @@ def send(rec: rr.RecordingStream, entity: str, t: Array, archetype: Any, **value
         rec.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=times[part])], columns)
 
 
+def send_clouds(rec: rr.RecordingStream, entity: str, t: Array, clouds: list[Array], points: Any) -> None:
+    """Send sets of points (P, 2 or 3) at times t [s], one set each; `points` is the archetype."""
+    columns = points.columns(positions=np.concatenate(clouds).astype(np.float32))
+    times = rr.TimeColumn(TIMELINE, duration=nanoseconds(t))
+    rec.send_columns(entity, [times], columns.partition([len(cloud) for cloud in clouds]))
+
+
 def send_metadata(rec: rr.RecordingStream, run: Run, name: str) -> None:
     """Send the metadata of a run, and its columns in their order."""
     specs = {key: said_of(run.spec(key), key) for key in run}

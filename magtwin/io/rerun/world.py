@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import quat_multiply, rotate, wrap_angle
 from magtwin.io.rerun.layout import Colour
-from magtwin.io.rerun.series import TIMELINE, entity_of, nanoseconds, send
+from magtwin.io.rerun.series import TIMELINE, entity_of, send, send_clouds
 from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
@@ -193,9 +193,7 @@ class Feed:
         for start in range(self._sent, end, SCANS):
             rows = slice(start, min(end, start + SCANS))
             part = [self._points[k] for k in self._order[rows]]
-            columns = rr.Points3D.columns(positions=np.concatenate(part).astype(np.float32))
-            times = rr.TimeColumn(TIMELINE, duration=nanoseconds(self._t[rows]))
-            self._rec.send_columns(SCAN, [times], columns.partition([len(p) for p in part]))
+            send_clouds(self._rec, SCAN, self._t[rows], part, rr.Points3D)
         self._sent = max(self._sent, end)
 
     def clear(self, t: float) -> None:

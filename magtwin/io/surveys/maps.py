@@ -1,8 +1,9 @@
 """Maps of surveys, from files to files: import, fit, validate."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -92,17 +93,9 @@ def fit_survey(
     out = check_free(out, force=force)
     options = _method_options([method], kernel, earth_nt).get(method, {})
     readings, report = survey_and_report(sources, keep_stuck=keep_stuck)
-    return _fitted(
-        readings.with_(name=out.stem),
-        out,
-        report,
-        method,
-        spacing_m=spacing_m,
-        headings_rad=headings_rad,
-        progress=progress,
-        force=force,
-        **options,
-    )
+    readings = readings.with_(name=out.stem)
+    grid: dict[str, Any] = {"spacing_m": spacing_m, "headings_rad": headings_rad}
+    return _fitted(readings, out, report, method, options, progress=progress, force=force, **grid)
 
 
 def _fitted(
@@ -110,12 +103,11 @@ def _fitted(
     out: Path,
     report: Report,
     method: str = "auto",
+    options: Mapping[str, Any] = MappingProxyType({}),
     *,
-    spacing_m: float | None = None,
-    headings_rad: Sequence[float] | None = None,
-    progress: Progress | None = None,
-    force: bool = False,
-    **options: Any,
+    progress: Progress | None,
+    force: bool,
+    **grid: Any,
 ) -> Report:
     """Fit a map to readings, write it, and report on it and on the readings."""
     from magtwin.field.fit.choice import choice_report
@@ -123,7 +115,7 @@ def _fitted(
 
     doubts = [*_doubts(readings), *_shared(readings, method)]
     model = fit(readings, method, progress=progress, **options)
-    field = raster(model, readings, spacing_m=spacing_m, headings_rad=headings_rad, progress=progress)
+    field = raster(model, readings, progress=progress, **grid)
     save_map(field, out, force=force)
     report = _with_doubts(report, [*doubts, *_masked(field)])
     return _joined(field.report(), choice_report(field.parameters), grid_report(field), report)
