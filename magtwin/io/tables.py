@@ -109,7 +109,10 @@ def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | N
         if FACTS not in (about.metadata or {}):
             return _others(path, columns)
         table = load_parquet(path)
-        return run_of(table.rename_columns(_renamed(table.column_names, columns or {}, path)), path)
+        if columns:
+            names, about = _renamed(table.column_names, columns, path), table.schema.metadata
+            table = table.rename_columns(names).replace_schema_metadata(about)
+        return run_of(table, path)
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: damaged Parquet (a name is no text); write it again") from error
 

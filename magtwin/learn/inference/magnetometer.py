@@ -157,8 +157,8 @@ class NeuralMagnetometer(Summarized):
             mean, sd = self.net.predict(x)
             wide = None if own else self.net.wide_sd_nt(x)
             flags = self.net.outside(x) if outside else None
-            if flags is not None and flags.mean() > MANY:
-                warnings.warn(self.net.inputs.worst(x), MismatchWarning, stacklevel=3)
+            if flags is not None and flags.mean() > MANY and (worst := self.net.inputs.worst(x)):
+                warnings.warn(worst, MismatchWarning, stacklevel=3)
             made.append(Read(mean, sd, flags, wide, self._intervals(own, wide is not None)))
         return made
 
