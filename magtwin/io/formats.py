@@ -166,10 +166,9 @@ def write_run(
         raise InputError(f"{path}: {format_.name} has no option {unknown[0]!r}; drop it")
     check_clock(run, "the run to write")
     if twin is not None and twin.stage is not None and "scene_file" in format_.takes:
-        raise InputError(
-            f"{path}: {format_.name} names the scene's file, and this scene has none; author it with "
-            "magtwin.author.scene.author_scene and open that, or leave out twin"
-        )
+        advice = "author it with magtwin.author.scene.author_scene and open that, or leave out twin"
+        text = f"{format_.name} names the scene's file, and this scene has none"
+        raise InputError(f"{path}: {text}; {advice}")
     known = {"twin": twin, "planned": planned, "scans": scans, "scene_file": twin and twin.scene_file}
     given = {name: value for name, value in known.items() if name in format_.takes}
     _function(format_.write)(run, path, force=force, **given, **options)
@@ -181,10 +180,9 @@ def format_of(path: Path) -> Format:
         return BAG
     suffix = path.suffix if path.suffix in FORMATS else path.suffix.lower()
     if suffix == ".usdz":
-        raise InputError(
-            f"{path}: a package; give the run that was put into it, or unpack it (magtwin export "
-            f"{quote(str(path))} --out FOLDER) and give the layer of the run, ..._run.usdc"
-        )
+        unpack = f"unpack it (magtwin export {quote(str(path))} --out FOLDER)"
+        text = f"give the run that was put into it, or {unpack} and give the layer of the run, ..._run.usdc"
+        raise InputError(f"{path}: a package; {text}")
     if suffix not in FORMATS:
         raise InputError(f"{path}: unknown format of a run; {hint(path.suffix, dict.fromkeys(FORMATS))}")
     return FORMATS[suffix]
@@ -241,7 +239,5 @@ def _in_folder(folder: Path) -> tuple[Path, Format]:
         return folder / "run.parquet", PARQUET
     if any(folder.glob("*.parquet")):
         return folder, PARQUET
-    raise InputError(
-        f"{folder}: a folder without a run; name a file ({', '.join(FORMATS)}), or a folder with a bag, "
-        "Parquet parts or run.parquet"
-    )
+    advice = f"name a file ({', '.join(FORMATS)}), or a folder with a bag, Parquet parts or run.parquet"
+    raise InputError(f"{folder}: a folder without a run; {advice}")

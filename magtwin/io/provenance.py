@@ -122,16 +122,8 @@ def made_again(
 ) -> Run:
     """Reproduce a run from its metadata, or drive the same with another engine or seed.
 
-    Args:
-        run: As for `repeat`.
-        scene: As for `repeat`.
-        near: As for `repeat`.
-        engine: "kinematic" or "newton". Default: the run's engine.
-        seed: Seed of all noise. Default: the run's seed.
-        progress: As for `magtwin.twin.engine_named`.
-
-    Raises:
-        InputError: As for `repeat`; or the engine is unknown or not installed.
+    `run`, `scene`, `near` and errors are those of `repeat`. `engine` is "kinematic" or "newton", `seed` that
+    of all noise; by default those of the run. `progress` is as for `magtwin.twin.engine_named`.
     """
     metadata = run.metadata
     if "seed" not in metadata and seed is None:

@@ -125,10 +125,8 @@ class Stream:
         if len(t) and t[0] <= self._t:
             raise InputError(f"time runs backwards: rows at {t[0]:.9g} s come after rows at {self._t:.9g} s")
         if len(t) and not t[-1] + self.later_s < LATEST_S:
-            raise InputError(
-                f"t runs from {t[0]:.9g} to {t[-1]:.9g} s, but stamps of ROS hold 0 to {LATEST_S:.0f} s: "
-                "subtract the first time from t"
-            )
+            held = f"stamps of ROS hold 0 to {LATEST_S:.0f} s: subtract the first time from t"
+            raise InputError(f"t runs from {t[0]:.9g} to {t[-1]:.9g} s, but {held}")
         # Rows of the same nanosecond are stamped 1 ns apart; their t is in /magtwin/reading.
         count = np.arange(len(t))
         stamps = np.rint((t + self.later_s) * NS).astype(np.int64) - count

@@ -145,15 +145,9 @@ class _Bag:
 class RawBagWriter:
     """A bag that grows by messages in CDR, of any topics; a killed process leaves all that was flushed.
 
-    Until it ends it has another name: `run.partial.mcap` for `run.mcap`, `bag.partial` for a folder `bag`.
-    `read_bag` reads it at any time.
-
-    Args:
-        path: The folder to make, or a single file that ends in .mcap.
-        force: Replace an existing bag, and the rest of an earlier recording.
-
-    Raises:
-        InputError: The path exists and `force` is not set, or cannot be written.
+    The path is that of a folder to make, or of a single file that ends in .mcap. Until the bag ends it has
+    another name: `run.partial.mcap` for `run.mcap`, `bag.partial` for a folder `bag`; `read_bag` reads it at
+    any time. `force` replaces an existing bag, and the rest of an earlier recording.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, force: bool = False) -> None:

@@ -55,16 +55,9 @@ def read_recording(
     unit: Unit | None = None,
     scale: float | None = None,
 ) -> "Recording":
-    """Read what a robot recorded.
+    """What a robot recorded, in a rosbag2 or a bag of ROS 1 (.bag).
 
-    Args:
-        path: Folder of a rosbag2, its storage file (.mcap, .db3), or a bag of ROS 1 (.bag).
-        topics: Topics of roles, as for `magtwin.io.bags.read_bag`.
-        unit: Unit of the field. Default: the unit that makes it the Earth's field.
-        scale: Factor from the bag's values to nT, in place of a unit.
-
-    Raises:
-        InputError: As for `magtwin.io.bags.read_bag`.
+    Arguments and errors are those of `magtwin.io.bags.read_bag`.
     """
     check_roles(topics or {})
     with Bag(Path(path)) as bag, np.errstate(over="ignore", invalid="ignore"):

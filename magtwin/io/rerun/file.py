@@ -46,23 +46,14 @@ def write_rrd(
     scans: Scans | None = None,
     force: bool = False,
 ) -> None:
-    """Write a run as a Rerun recording with a layout.
+    """Write a run as a Rerun recording (.rrd) with a layout; one without rows is refused.
 
     Every column is stored exactly and at full rate on the timeline `sim_time`; poses are drawn at 50 Hz at
     most. The recording's id comes from the run's content, so two files of one run hold the same recording.
     Only Rerun's own ids of chunks, rows and views differ, which `rerun rrd compare --unordered` ignores.
 
-    Args:
-        run: The run.
-        path: The .rrd file to make.
-        twin: Where the run took place: its stage and its map are shown. None: only series.
-        planned: The planned path, or None.
-        scans: LiDAR scans, drawn as points in world, or None.
-        force: Whether to replace an existing file.
-
-    Raises:
-        InputError: The file exists and `force` was not given or it cannot be written, the stage cannot be
-            read, or the run has no rows.
+    The `twin` is where the run took place: its stage and its map are shown, with the `planned` path and the
+    LiDAR's `scans` as points in world. Without it there are only series. `force` replaces an existing file.
     """
     _check_rows(run, path)
     name, size = title_of(run) or FilePath(path).stem, size_of(run, scans)
@@ -140,10 +131,8 @@ def read_run(path: str | os.PathLike[str]) -> Run:
     """The run of a recording, equal to the written one to the bit; refused if it holds none, or several."""
     runs = read_runs(path)
     if len(runs) > 1:
-        raise InputError(
-            f"{path}: compares {len(runs)} runs ({', '.join(runs)}); read the file of one of them, or use "
-            "magtwin.io.rerun.file.read_runs"
-        )
+        advice = "read the file of one of them, or use magtwin.io.rerun.file.read_runs"
+        raise InputError(f"{path}: compares {len(runs)} runs ({', '.join(runs)}); {advice}")
     return next(iter(runs.values()))
 
 

@@ -218,10 +218,10 @@ def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | N
             own[name] = spec_said({key: str(text) for key, text in names[name].items()}, parts)
         run = Run(columns, metadata, own)
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError, pa.ArrowException) as error:
-        raise InputError(
-            f"{what}: a Rerun recording, but not one of a run that magtwin can read "
-            f"({type(error).__name__}: {error}); read the run's Parquet, or record it again"
-        ) from error
+        text = (
+            f"a Rerun recording, but not one of a run that magtwin can read ({type(error).__name__}: {error})"
+        )
+        raise InputError(f"{what}: {text}; read the run's Parquet, or record it again") from error
     return str(static.get(NAME) or COLUMNS_ENTITY), run, rows
 
 

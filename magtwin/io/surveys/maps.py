@@ -158,10 +158,9 @@ def _doubts(readings: Readings) -> list[str]:
 
     count, yaw, doubts = int(readings.good.sum()), readings.yaw[readings.good], list[str]()
     if readings.grid is None and count < LEAST_READINGS:
-        raise InputError(
-            f"{readings.name}: {count} of {len(readings)} readings are good{masked_words(readings)}; a map "
-            f"needs {LEAST_READINGS} at least, and some hundred to be of use"
-        )
+        text = f"a map needs {LEAST_READINGS} at least, and some hundred to be of use"
+        good = f"{count} of {len(readings)} readings are good{masked_words(readings)}"
+        raise InputError(f"{readings.name}: {good}; {text}")
     if readings.grid is None and count < USUAL_READINGS:
         doubts.append(f"only {count} good readings: the map is valid only next to them")
     if line := changes_line(readings):

@@ -245,10 +245,9 @@ def _check_roles(table: Table, columns: Columns) -> None:
         column = table.column(name)
         if other := seen.get(id(column)):
             both = f"{role} twice" if other == role else f"{other} and {role} at once"
-            raise InputError(
-                f"{table.path}: column {column.name or name!r} cannot be {both}; name other columns with "
-                "--x, --y, --heading, --quaternion, --field, --vector or --time"
-            )
+            advice = "--x, --y, --heading, --quaternion, --field, --vector or --time"
+            text = f"column {column.name or name!r} cannot be {both}; name other columns with {advice}"
+            raise InputError(f"{table.path}: {text}")
         seen[id(column)] = role
     z = next((label for label in table.names if split_label(label).words == ("z",)), "")
     places = [split_label(table.column(name).name).words for name in (columns.x, columns.y)]
@@ -261,10 +260,8 @@ def _check_roles(table: Table, columns: Columns) -> None:
     b = table.numbers(columns.field)
     known = np.isfinite(length) & (b > 0)
     if known.any() and np.median(np.abs(length[known] / b[known] - 1)) < SAME_LENGTH:
-        raise InputError(
-            f"{table.path}: {columns.x}, {columns.y} and {z} are the components of {columns.field}, no "
-            "positions; name those with --x and --y"
-        )
+        text = f"{columns.x}, {columns.y} and {z} are the components of {columns.field}, no positions"
+        raise InputError(f"{table.path}: {text}; name those with --x and --y")
 
 
 def _times(table: Table, columns: Columns, told: Columns, taken: list[str]) -> Array | None:
@@ -334,30 +331,26 @@ def _check_vectors(table: Table, columns: Columns, vector: Array, b: Array, turn
     """Refuse vectors of another size than the magnitudes, and in other axes or headings than those given."""
     ratio = float(np.median(np.linalg.norm(vector, axis=1) / b))
     if not 1 / APART <= ratio <= APART:
-        raise InputError(
-            f"{table.path}: {columns.vector} is {ratio:.3g} times as long as {columns.field} (median); "
-            "give both in one unit, and the components of the whole field"
-        )
+        text = f"{columns.vector} is {ratio:.3g} times as long as {columns.field} (median)"
+        advice = "give both in one unit, and the components of the whole field"
+        raise InputError(f"{table.path}: {text}; {advice}")
     said = columns.axes or "body"
     best, kept = other_axes(vector, turn, said)
     if not best:
         return
     they = f"{table.path}: {columns.vector} are taken to be in {said} axes, but they keep one direction"
+    they += f" ({100 * kept:.0f} % of them)"
     if best != "mirrored":
-        raise InputError(
-            f"{they} ({100 * kept:.0f} % of them) in {best} axes, as the Earth's field does: give "
-            f"--axes {best}, or correct the headings or the order of the components"
-        )
+        advice = f"give --axes {best}, or correct the headings or the order of the components"
+        raise InputError(f"{they} in {best} axes, as the Earth's field does: {advice}")
     turned = "give --heading-unit compass for headings clockwise from north"
     if columns.quaternion:
         turned = "change the signs of x, y and z of a quaternion that turns world to body"
     elif columns.heading_unit == "compass":
         turned = "give --heading-unit deg for headings counter-clockwise from +x"
-    body_axes = "give --axes body, and " if said == "world" else ""
-    raise InputError(
-        f"{they} ({100 * kept:.0f} % of them) if headings turn the other way, or if they are forward, "
-        f"right, down: {body_axes}{turned}, or change the signs of the second and third component in the file"
-    )
+    turned = f"give --axes body, and {turned}" if said == "world" else turned
+    turned += ", or change the signs of the second and third component in the file"
+    raise InputError(f"{they} if headings turn the other way, or if they are forward, right, down: {turned}")
 
 
 def _turn(table: Table, columns: Columns) -> Array | None:
@@ -373,12 +366,9 @@ def _turn(table: Table, columns: Columns) -> Array | None:
         return np.radians(90.0 - heading)
     if columns.heading_unit is None and (beyond := np.abs(heading) > LARGEST_TURN).any():
         k = int(beyond.argmax())
-        where = table.column(columns.heading).where(k)
-        raise InputError(
-            f"{where}: heading {heading[k]:g} is beyond a full turn in radians; "
-            "give --heading-unit deg (counter-clockwise from +x), compass (clockwise from north) or, if it "
-            "counts turns, rad"
-        )
+        text = f"heading {heading[k]:g} is beyond a full turn in radians; give --heading-unit deg"
+        text += " (counter-clockwise from +x), compass (clockwise from north) or, if it counts turns, rad"
+        raise InputError(f"{table.column(columns.heading).where(k)}: {text}")
     return heading
 
 

@@ -114,17 +114,14 @@ def _in_clock(at: Array, begin: float, end: float, table: Table, marks: Marks, n
     """Times of marks in the clock of a table, whose begin and end are given."""
     if at[-1] < begin or at[0] > end:
         if not -1 <= at[0] < at[-1] <= 1.05 * (end - begin) + 1:
-            raise InputError(
-                f"{table.path}: {begin:.10g} to {end:.10g} s, and {marks.name}: {at[0]:.10g} to "
-                f"{at[-1]:.10g} s, have no time in common; count both from the start of the log"
-            )
+            both = f"{begin:.10g} to {end:.10g} s, and {marks.name}: {at[0]:.10g} to {at[-1]:.10g} s"
+            text = f"{both}, have no time in common; count both from the start of the log"
+            raise InputError(f"{table.path}: {text}")
         at = at + begin
         notes.append(f"the times of {marks.name} from the start of {table.path.name}")
     if (covered := (min(at[-1], end) - max(at[0], begin)) / max(end - begin, 1e-9)) < LEAST_COVERED:
-        raise InputError(
-            f"{table.path}: {marks.name} covers {100 * covered:.2g} % of its {end - begin:.6g} s; "
-            "give both times in one unit, such as t [ms]"
-        )
+        text = f"{marks.name} covers {100 * covered:.2g} % of its {end - begin:.6g} s"
+        raise InputError(f"{table.path}: {text}; give both times in one unit, such as t [ms]")
     return at
 
 
