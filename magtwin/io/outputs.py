@@ -132,8 +132,8 @@ class Outputs:
     out_unit: Literal["T", "nT"] | None = None  # Unit of the field in bags. None: T.
     usd_fps: float | None = None  # Frames per second in USD, 0 for one per reading. None: 30.
     robot: str = ""  # Robot whose name becomes part of the file names, in a scene of several
+    # Draws run.png in the folder: called with the run, the file and `force`
     picture: Callable[[Driven, Path, bool], None] | None = None
-    """Draws run.png in the folder: called with the run, the file and `force`."""
 
     @classmethod
     def of(cls, out: "list[Path] | tuple[Path, ...]", *, scans: bool = False, **options: Any) -> "Outputs":
@@ -224,7 +224,9 @@ class Outputs:
     def write(self, driven: Driven) -> None:
         """Write the run to every target, each format once."""
         written: dict[str, Path] = {}
-        for target in sorted(self._runs(), key=lambda file: file.suffix.lower() in USD):
+        names = () if self.folder is None else IN_FOLDER
+        inside = [_with_name((self.folder or Path()) / name, self.robot) for name in names]
+        for target in sorted([*inside, *self.files], key=lambda file: file.suffix.lower() in USD):
             if target.suffix.lower() in written:
                 shutil.copyfile(written[target.suffix.lower()], target)
                 continue
@@ -239,16 +241,10 @@ class Outputs:
         if driven.scans is not None:
             from magtwin.io.scans import write_scans
 
-            inside = [] if self.folder is None else [_with_name(self.folder / "run.parquet", self.robot)]
-            for file in (*map(_scans_of, inside), *self.scans):
+            for file in (*map(_scans_of, inside[1:]), *self.scans):
                 write_scans(driven.scans, file, force=self.force)
         if self.folder is not None and self.picture is not None:
             self.picture(driven, _with_name(self.folder / "run.png", self.robot), self.force)
-
-    def _runs(self) -> list[Path]:
-        """Files that hold the run."""
-        inside = [] if self.folder is None else [self.folder / name for name in IN_FOLDER]
-        return [*(_with_name(file, self.robot) for file in inside), *self.files]
 
 
 def _scans_of(file: Path) -> Path:

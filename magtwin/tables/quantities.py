@@ -67,10 +67,9 @@ IN_BRACKETS = frozenset({"t", "g", "min", "h"})
 class Quantity:
     """What a column may hold."""
 
+    # Its names, the usual one first, in lower case with low lines between words, and `|` between equals.
+    # Those of one place belong together in quantities of one kind, as easting and northing.
     names: str
-    """Its names, the usual one first, in lower case with low lines between words, and `|` between equals.
-    Those of one place belong together in quantities of one kind, as easting and northing."""
-
     units: Mapping[str, float]  # Factors to SI units or nT, by unit in lower case
     beside: str = ""  # Words before or behind a name that say where it comes from
 

@@ -32,11 +32,9 @@ class Leaf:
     """A number, stamp or string of a message, or several of them in a row."""
 
     name: str  # Path in the message, such as `pose.position`
-
+    # numpy code of a number; `time` for int32 seconds and uint32 nanoseconds; `text`; or `none` for a
+    # sequence that must be empty
     kind: str
-    """numpy code of a number; `time` for int32 seconds and uint32 nanoseconds; `text`; or `none` for a
-    sequence that must be empty."""
-
     count: int | None = 1  # How many in a row. None: a sequence, whose length stands in the message.
 
 

@@ -166,8 +166,8 @@ class McapWriter:
 
     def _put_chunk(self, first: int, last: int, content: Bytes, raw: bytes, index: dict[int, Any]) -> None:
         begin = self._file.tell()
-        crc = zlib.crc32(content.data)
-        self._file.write(_bytes(records.Chunk("zstd", raw, last, first, crc, len(content))))
+        chunk = records.Chunk("zstd", raw, last, first, zlib.crc32(content.data), len(content))
+        self._file.write(_bytes(chunk))
         end = self._file.tell()
         offsets, indexes = {}, b""
         for channel, entries in index.items():

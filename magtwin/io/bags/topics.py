@@ -56,26 +56,20 @@ class Topic:
     qos: Qos = field(default_factory=Qos)
     needs: tuple[str, ...] = ()  # Columns without which it is not written
     carried: bool = False  # Whether a bag's reader takes the columns of `needs` from this topic
-
+    # When messages are sent: when a needed column changes and again every `every_s` while it stays; at each
+    # reading that has a value; in even steps of `every_s`; or once
     sent: Literal["changed", "each", "ticks", "once"] = "changed"
-    """When messages are sent: when a needed column changes and again every `every_s` while it stays; at each
-    reading that has a value; in even steps of `every_s`; or once."""
-
     every_s: float = 0.1  # Time after which an unchanged value is sent again, or the length of a step [s]
     lost: str = ""  # Column of flags that suspend sending again
     frame: str = ""  # Attribute of the sender with the frame of the header. Default: no header.
-
+    # Columns of flags that select the text of a message; messages are written for equal flags at a time
     by: tuple[str, ...] = ()
-    """Columns of flags that select the text of a message; messages are written for equal flags at a time."""
-
+    # Fields of messages beyond the header and the columns of `reads`; also called with the stamps [ns]
     more: Callable[[Columns, NDArray[np.int64], Sender], Fields] = lambda c, stamp, sender: {}
-    """Fields of messages beyond the header and the columns of `reads`; also called with the stamps [ns]."""
-
+    # By message type: the leaf of each column that is read, a leaf and an index, or several leaves
     reads: Mapping[str, Mapping[str, str | tuple[str, int] | tuple[str, ...]]] = field(default_factory=dict)
-    """By message type: the leaf of each column that is read, a leaf and an index, or several leaves."""
-
+    # By message type: the columns in the axes of REP 103, of columns in others
     turned: Mapping[str, Callable[[dict[str, Array]], dict[str, Array]]] = field(default_factory=dict)
-    """By message type: the columns in the axes of REP 103, of columns in others."""
 
     def write(self, c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
         """Fields of messages, from the columns of some rows and their stamps [ns]."""

@@ -69,8 +69,8 @@ class Mount(NamedTuple):
 class StaticFrames:
     """Transforms that do not change: those of /tf_static, and of a robot's description."""
 
+    # By frame: its parent, its origin [m] and its axes (xyzw) there
     parents: dict[str, tuple[str, Array, Array]] = field(default_factory=dict)
-    """By frame: its parent, its origin [m] and its axes (xyzw) there."""
 
     def add(self, parent: str, child: str, p: Array, q_xyzw: Array) -> None:
         """Take a transform; one that is no number or no rotation is left out."""

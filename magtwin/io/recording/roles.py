@@ -26,10 +26,8 @@ class Role:
     kinds: tuple[str, ...] = ()  # Message types of this role alone
     named: str = ""  # Words that make a topic of another readable type one of the role
     never: str = ""  # Words of topics that are not of the role
-
+    # Words by rank; topics with a word of an earlier rank go before. "*" is the rank of other topics.
     ranks: tuple[str, ...] = ()
-    """Words by rank; topics with a word of an earlier rank go before. "*" is the rank of other topics."""
-
     option: str = ""  # Option that chooses. Default: --remap.
     position: str = ""  # Column of the position of the child frame in that of the header, which is still
     orientation: str = ""  # Orientation of the child frame; without `position`, that of the header

@@ -4,6 +4,7 @@ import os
 import tempfile
 import warnings
 from collections.abc import Mapping
+from itertools import cycle
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -90,10 +91,8 @@ def write_comparison(
     entities = {entity_of("", name) for name in runs}
     if len(entities) < len(runs) or "" in entities:
         raise InputError(f"{path}: runs that are compared need names that differ, got {', '.join(runs)}")
-    compared = [
-        Shown.of(run, name=name, colour=RUN_COLOURS[k % len(RUN_COLOURS)])
-        for k, (name, run) in enumerate(runs.items())
-    ]
+    colours = cycle(RUN_COLOURS)
+    compared = [Shown.of(run, name=name, colour=next(colours)) for name, run in runs.items()]
     first = next(iter(runs.values()))
     lab, heading = (None, 0.0) if twin is None else (twin.scene.lab, heading_of(twin.field, first))
     size = ROOM + sum(map(size_of, runs.values()))

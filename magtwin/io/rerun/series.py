@@ -243,8 +243,8 @@ class Flags:
     name: str = ""
 
     _before: dict[str, bool] = field(default_factory=dict)
+    # Open events by column: time of the start and of the last raised row [s], and place of the latter
     _open: dict[str, tuple[float, float, str]] = field(default_factory=dict)
-    """Open events by column: time of the start and of the last raised row [s], and place of the latter."""
 
     def append(self, run: Run) -> None:
         """Add the next rows."""

@@ -265,7 +265,12 @@ class Robot:
             rate = self.rate_hz or ((run.rows - 1) / run.duration_s if run.duration_s else 0.0)
             self._strides = _stride(rate, POSE_HZ), _stride(rate, DOT_HZ)
             if self.scale is not None and np.isfinite(run.get("b_vector_nt", np.nan)).any():
-                self._send_vector_style()
+                # The field arrow in sensor axes, with its middle at the sensor
+                entity, robot = f"{entity_of('world/robot', self.name)}/magnetometer", self.interior.robot
+                place = _transform(robot.p_base_magnetometer, robot.q_base_magnetometer_xyzw)
+                self.rec.log(entity, place, static=True)
+                style = rr.Arrows3D.from_fields(colors=[(255, 255, 255)], radii=[0.006])
+                self.rec.log(f"{entity}/field", style, static=True)
         first, poses, dots = self._rows, *self._strides
         self._rows += run.rows
         self._pose(run, np.arange(-first % poses, run.rows, poses))
@@ -300,14 +305,6 @@ class Robot:
             if len(arrows):
                 entity = f"{root}/magnetometer/field"
                 send(rec, entity, t[known], rr.Arrows3D, vectors=arrows, origins=-arrows / 2)
-
-    def _send_vector_style(self) -> None:
-        """Pose and style of the field arrow in sensor axes, with its middle at the sensor."""
-        entity, robot = f"{entity_of('world/robot', self.name)}/magnetometer", self.interior.robot
-        place = _transform(robot.p_base_magnetometer, robot.q_base_magnetometer_xyzw)
-        self.rec.log(entity, place, static=True)
-        style = rr.Arrows3D.from_fields(colors=[(255, 255, 255)], radii=[0.006])
-        self.rec.log(f"{entity}/field", style, static=True)
 
     def _trail(self, run: Run, rows: NDArray[np.intp]) -> None:
         """The path on the floor, and above it a ribbon of the readings at the sensor's positions."""

@@ -58,9 +58,8 @@ def examine(
     known &= True if vector_nt is None else np.isfinite(vector_nt).all(axis=1)
     share = round(100 * float(known.mean()), 1) if len(b_nt) else 0.0
     figures = [Figure("field in", unit), Figure("finite readings", share, "%", note=f"of {len(b_nt):,}")]
-    given = (b_nt, vector_nt, t, p_xy, yaw)
-    b, vector, clock, p, angle = (None if values is None else values[known] for values in given)
-    assert b is not None
+    b, given = b_nt[known], (vector_nt, t, p_xy, yaw)
+    vector, clock, p, angle = (None if values is None else values[known] for values in given)
     doubts, sectors = list[str](), 0
     if len(b) > 2:
         low, usual, high = np.quantile(b, (0.01, 0.5, 0.99))

@@ -53,7 +53,8 @@ def import_survey(
     out, columns, about = check_free(out, force=force), reading.get("columns") or Columns(), about or About()
     name = about.name or out.stem
     table = out.suffix.lower() == ".parquet"
-    if not table and len(sources) == 1 and _is_grid(Path(sources[0]), columns):
+    unnamed = replace(columns, unit=None, scale=None) == Columns()
+    if not table and len(sources) == 1 and kind_of(Path(sources[0])) is SURVEY and unnamed:
         known = {**asdict(about), "name": name, "unit": columns.unit or "nT", "scale": columns.scale}
         field, report = read_folder(sources[0], **known, keep_stuck=reading.get("keep_stuck", False))
         save_map(field, out, force=force)
@@ -145,11 +146,6 @@ def validate_methods(
     if split is None:
         split = "checkerboard" if readings.grid is not None else "run" if len(readings.runs) > 1 else "block"
     return check(readings, chosen, split=split, options=options, progress=progress)
-
-
-def _is_grid(source: Path, columns: Columns) -> bool:
-    """Whether a source is a folder with one CSV per heading, whose columns need no names."""
-    return kind_of(source) is SURVEY and replace(columns, unit=None, scale=None) == Columns()
 
 
 def _doubts(readings: Readings) -> list[str]:

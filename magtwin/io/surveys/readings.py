@@ -76,7 +76,8 @@ def read_readings(
     parts, given, twice = [], dict[str, Source](), list[str]()
     topics = {POSE: pose_topic, MAGNITUDE: field_topic}
     for source in _each(sources):
-        same = given.setdefault(_identity(source), source)
+        path = Path(source)
+        same = given.setdefault(sha256(path) if path.is_file() else str(path.resolve()), source)
         if same is not source:
             twice.append(f"{source} and {same} as one, since their bytes are equal")
             continue
@@ -142,12 +143,6 @@ def _each(sources: Sequence[Source]) -> Iterator[Source]:
             yield from sorted(file for file in path.iterdir() if file.suffix.lower() in PARQUET) or [path]
         else:
             yield source
-
-
-def _identity(source: Source) -> str:
-    """The checksum of a file; the place of a folder, or of joined files."""
-    path = Path(source)
-    return sha256(path) if path.is_file() else str(path.resolve())
 
 
 def _part(

@@ -118,8 +118,8 @@ def _flight(path: Path) -> Columns:
                 columns[label] = np.asarray(found[()], float)
     if "field [nT]" not in columns:
         held = ", ".join(sorted(known)[:12]) or "no data sets"
-        names = ", ".join(FLIGHT["field [nT]"])
-        raise InputError(f"{path}: no field in it under the names {names}; it has {held}")
+        tried = ", ".join(FLIGHT["field [nT]"])
+        raise InputError(f"{path}: no field in it under the names {tried}; it has {held}")
     rows = len(columns["field [nT]"])
     if "x [m]" in columns:
         columns.pop("lon", None), columns.pop("lat", None)

@@ -138,8 +138,7 @@ def _steps(t: Array, acceleration: Array) -> Array:
 
 def _moved(t: Array, stills: list[tuple[float, float]]) -> Array:
     """Time on the move until each time [s], without pauses."""
-    rest = sum((np.clip(t, a, b) - a for a, b in stills), start=np.zeros(len(t)))
-    return np.asarray(t - rest)
+    return np.asarray(t - sum((np.clip(t, a, b) - a for a, b in stills), start=np.zeros(len(t))))
 
 
 def _stills(t: Array, acceleration: Array) -> list[tuple[float, float]]:
