@@ -181,7 +181,7 @@ class Stream:
                 entry["first"] = first
                 first += shape[0] if shape else 1
             columns.append(entry)
-        table = {"unit": self._sender.unit, "columns": columns}
+        table: dict[str, Any] = {"unit": self._sender.unit, "columns": columns}
         table |= {"facts": dict(metadata)} if metadata else {}
         return json.dumps(table, ensure_ascii=False, indent=1)
 
