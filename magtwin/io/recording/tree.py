@@ -108,8 +108,8 @@ class Tree:
         for rank in ("base_link", "base_footprint", ""):
             if best := sorted(name for name in found if name.endswith(rank)):
                 if len(best) > 1 and rank:
-                    names = ", ".join(best)[:200]
-                    raise InputError(f"/tf has {len(best)} robots, {names}; record one of them")
+                    robots = ", ".join(best)[:200]
+                    raise InputError(f"/tf has {len(best)} robots, {robots}; record one of them")
                 return best[0]
         return ""
 
