@@ -37,9 +37,7 @@ def convert_run(
         raise InputError(f"{out}: holds the run, which would be removed with it; give another name")
     check_free(out, force=force)
     given = {"units": out_unit, "fps": usd_fps}
-    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    if usd_fps == 0:
-        options["fps"] = None
+    options: dict[str, Any] = {name: value or None for name, value in given.items() if value is not None}
     takes = format_to_write(out).takes
     if scene is not None and not takes & {"twin", "scene_file"}:
         raise InputError(f"{out}: a table shows no scene; drop `scene`", parameter="scene")

@@ -53,13 +53,11 @@ class Format:
     given, and options, which other formats refuse."""
 
 
-_TABLES, _RERUN = "magtwin.io.tables", "magtwin.io.rerun.file"
+_IN, _RERUN = "magtwin.io.tables", "magtwin.io.rerun.file"
 _NAMED = frozenset(("columns",))
-PARQUET = Format(
-    name="Parquet", read=f"{_TABLES}:read_parquet", write=f"{_TABLES}:write_parquet", reads=_NAMED
-)
-CSV = Format(name="CSV", read=f"{_TABLES}:read_csv", write=f"{_TABLES}:write_csv", reads=_NAMED)
-NPZ = Format(name="npz", read=f"{_TABLES}:read_npz", write=f"{_TABLES}:write_npz")
+PARQUET = Format(name="Parquet", read=f"{_IN}:read_parquet", write=f"{_IN}:write_parquet", reads=_NAMED)
+CSV = Format(name="CSV", read=f"{_IN}:read_csv", write=f"{_IN}:write_csv", reads=_NAMED)
+NPZ = Format(name="npz", read=f"{_IN}:read_npz", write=f"{_IN}:write_npz")
 _SHOWN = frozenset(("twin", "planned", "scans"))
 RERUN = Format(name="Rerun", read=f"{_RERUN}:read_run", write=f"{_RERUN}:write_rrd", takes=_SHOWN)
 RELEASE = Format(name="released package", read="magtwin.io.release:read_release")
@@ -89,9 +87,8 @@ BAGS = (".mcap", ".db3", ".bag")  # Suffixes of storage files of bags
 _SUFFIXES = {".parquet": "PARQUET", ".csv": "CSV", ".npz": "NPZ", ".rrd": "RERUN", ".json": "RELEASE"}
 _SUFFIXES |= {".mcap": "BAG", ".db3": "DB3", ".bag": "ROS1", ".usd": "USD", ".usda": "USD", ".usdc": "USD"}
 
-FORMATS: Registry[Format] = Registry(
-    "run format", "formats", {suffix: f"{__name__}:{name}" for suffix, name in _SUFFIXES.items()}
-)
+_NAMES = {suffix: f"{__name__}:{name}" for suffix, name in _SUFFIXES.items()}
+FORMATS: Registry[Format] = Registry("run format", "formats", _NAMES)
 """Formats by suffix. A name without a suffix is a rosbag2 folder."""
 
 
@@ -169,12 +166,10 @@ def write_run(
         raise InputError(f"{path}: {format_.name} has no option {unknown[0]!r}; drop it")
     check_clock(run, "the run to write")
     if twin is not None and twin.stage is not None and "scene_file" in format_.takes:
-        raise InputError(
-            f"{path}: {format_.name} names the scene's file, and this scene has none; author it with "
-            "magtwin.author.scene.author_scene and open that, or leave out twin"
-        )
-    scene_file = None if twin is None else twin.scene_file
-    known = {"twin": twin, "planned": planned, "scans": scans, "scene_file": scene_file}
+        advice = "author it with magtwin.author.scene.author_scene and open that, or leave out twin"
+        text = f"{format_.name} names the scene's file, and this scene has none"
+        raise InputError(f"{path}: {text}; {advice}")
+    known = {"twin": twin, "planned": planned, "scans": scans, "scene_file": twin and twin.scene_file}
     given = {name: value for name, value in known.items() if name in format_.takes}
     _function(format_.write)(run, path, force=force, **given, **options)
 
@@ -185,10 +180,9 @@ def format_of(path: Path) -> Format:
         return BAG
     suffix = path.suffix if path.suffix in FORMATS else path.suffix.lower()
     if suffix == ".usdz":
-        raise InputError(
-            f"{path}: a package; give the run that was put into it, or unpack it (magtwin export "
-            f"{quote(str(path))} --out FOLDER) and give the layer of the run, ..._run.usdc"
-        )
+        unpack = f"unpack it (magtwin export {quote(str(path))} --out FOLDER)"
+        text = f"give the run that was put into it, or {unpack} and give the layer of the run, ..._run.usdc"
+        raise InputError(f"{path}: a package; {text}")
     if suffix not in FORMATS:
         raise InputError(f"{path}: unknown format of a run; {hint(path.suffix, dict.fromkeys(FORMATS))}")
     return FORMATS[suffix]
@@ -224,16 +218,10 @@ def runs_in(path: Path) -> list[Path]:
         return inside
     parts = any(next(path.glob(one), None) for one in ("*.db3", "part-*.parquet"))
     inside = [] if parts or kind_of(path) else sorted(path.glob("[!.]*"))
-    return [
-        file
-        for file in inside
-        if _holds_one(file) or (file.suffix.lower() in FORMATS and ".scans." not in file.name)
-    ] or [path]
-
-
-def _holds_one(folder: Path) -> bool:
-    """Whether a folder holds one run."""
-    return (folder / "metadata.yaml").is_file() or (folder / "run.parquet").is_file()
+    runs = [file for file in inside if file.suffix.lower() in FORMATS and ".scans." not in file.name]
+    known = ("metadata.yaml", "run.parquet")
+    runs += [folder for folder in inside if any((folder / name).is_file() for name in known)]
+    return sorted({*runs}) or [path]
 
 
 def is_bag(path: Path) -> bool:
@@ -251,7 +239,5 @@ def _in_folder(folder: Path) -> tuple[Path, Format]:
         return folder / "run.parquet", PARQUET
     if any(folder.glob("*.parquet")):
         return folder, PARQUET
-    raise InputError(
-        f"{folder}: a folder without a run; name a file ({', '.join(FORMATS)}), or a folder with a bag, "
-        "Parquet parts or run.parquet"
-    )
+    advice = f"name a file ({', '.join(FORMATS)}), or a folder with a bag, Parquet parts or run.parquet"
+    raise InputError(f"{folder}: a folder without a run; {advice}")

@@ -1,7 +1,6 @@
 """Info: what a run, a stage, a map or a network holds."""
 
 import os
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,11 +52,8 @@ def info_of(
         run = info_of_run(file, **reading)
         return replace(run, metadata={**run.metadata, "topics": report.metadata["topics"]})
     if file.is_dir():
-        return (
-            map_metadata(read_survey(file)[0])
-            if any(file.glob("*_map.csv"))
-            else info_of_run(file, **reading)
-        )
+        gridded = any(file.glob("*_map.csv"))
+        return map_metadata(read_survey(file)[0]) if gridded else info_of_run(file, **reading)
     if reading and file.suffix.lower() in (*NETWORKS, *STAGES):
         raise InputError(f"{file}: no recording; drop the option {next(iter(reading))!r}")
     if file.suffix.lower() in NETWORKS:
@@ -96,15 +92,11 @@ def _info_of_usd(file: Path) -> Report:
     if file.suffix.lower() != ".usdz" and is_animation(file):
         run = info_of_run(file)
         try:
-            return _with_figures(run, info_of_stage(file).figures)
+            return replace(run, figures=(*run.figures, *info_of_stage(file).figures))
         except InputError as error:  # the scene is missing, the run is complete
             return replace(run, metadata={**run.metadata, "stage": str(error)})
     if file.suffix.lower() == ".usdz" or not is_map_layer(file):
         return info_of_stage(file)
     card = map_metadata(load_map(file))
     stage = [figure for figure in info_of_stage(file).figures if figure.value != 0]
-    return replace(_with_figures(card, stage), title=f"{card.title} ({file})")
-
-
-def _with_figures(report: Report, figures: Sequence[Figure]) -> Report:
-    return replace(report, figures=(*report.figures, *figures))
+    return replace(card, title=f"{card.title} ({file})", figures=(*card.figures, *stage))

@@ -132,8 +132,8 @@ class Outputs:
     out_unit: Literal["T", "nT"] | None = None  # Unit of the field in bags. None: T.
     usd_fps: float | None = None  # Frames per second in USD, 0 for one per reading. None: 30.
     robot: str = ""  # Robot whose name becomes part of the file names, in a scene of several
+    # Draws run.png in the folder: called with the run, the file and `force`
     picture: Callable[[Driven, Path, bool], None] | None = None
-    """Draws run.png in the folder: called with the run, the file and `force`."""
 
     @classmethod
     def of(cls, out: "list[Path] | tuple[Path, ...]", *, scans: bool = False, **options: Any) -> "Outputs":
@@ -148,8 +148,7 @@ class Outputs:
             format_to_write(file)
         tables = tuple(_scans_of(file) for file in files if scans and file.suffix.lower() == ".parquet")
         made = cls(folders[0] if folders else None, files, tables, **options)
-        targets = made.targets
-        if len({target.resolve() for target in targets}) < len(targets):
+        if len({target.resolve() for target in made.targets}) < len(made.targets):
             raise InputError("two outputs have one name; give each its own")
         for name, value, takes in (("out_unit", made.out_unit, "units"), ("usd_fps", made.usd_fps, "fps")):
             if value is not None and not any(takes in format_of(file).takes for file in files):
@@ -193,12 +192,8 @@ class Outputs:
             if self.folder is not None:
                 places[self.folder].mkdir()
             try:
-                yield replace(
-                    self,
-                    folder=places[self.folder] if self.folder is not None else None,
-                    files=tuple(places[file] for file in self.files),
-                    scans=tuple(places[file] for file in self.scans),
-                )
+                files, scans = (tuple(map(places.__getitem__, some)) for some in (self.files, self.scans))
+                yield replace(self, folder=self.folder and places[self.folder], files=files, scans=scans)
             except InputError as error:
                 text = str(error)
                 for target, place in places.items():
@@ -229,31 +224,27 @@ class Outputs:
     def write(self, driven: Driven) -> None:
         """Write the run to every target, each format once."""
         written: dict[str, Path] = {}
-        for target in sorted(self._runs(), key=lambda file: file.suffix.lower() in USD):
+        names = () if self.folder is None else IN_FOLDER
+        inside = [_with_name((self.folder or Path()) / name, self.robot) for name in names]
+        for target in sorted([*inside, *self.files], key=lambda file: file.suffix.lower() in USD):
             if target.suffix.lower() in written:
                 shutil.copyfile(written[target.suffix.lower()], target)
                 continue
             written[target.suffix.lower()] = target
-            takes, options = format_of(target).takes, dict[str, Any]()
-            if self.out_unit is not None and "units" in takes:
-                options["units"] = self.out_unit
-            if self.usd_fps is not None and "fps" in takes:
-                options["fps"] = self.usd_fps or None
+            takes = format_of(target).takes
+            options: dict[str, Any] = {"units": self.out_unit, "fps": self.usd_fps}
+            options = {
+                name: value or None for name, value in options.items() if value is not None and name in takes
+            }
             options |= {"planned": driven.planned, "scans": driven.scans, "force": self.force}
             write_run(driven.run, target, driven.twin, **options)
         if driven.scans is not None:
             from magtwin.io.scans import write_scans
 
-            inside = [] if self.folder is None else [_with_name(self.folder / "run.parquet", self.robot)]
-            for file in (*map(_scans_of, inside), *self.scans):
+            for file in (*map(_scans_of, inside[1:]), *self.scans):
                 write_scans(driven.scans, file, force=self.force)
         if self.folder is not None and self.picture is not None:
             self.picture(driven, _with_name(self.folder / "run.png", self.robot), self.force)
-
-    def _runs(self) -> list[Path]:
-        """Files that hold the run."""
-        inside = [] if self.folder is None else [self.folder / name for name in IN_FOLDER]
-        return [*(_with_name(file, self.robot) for file in inside), *self.files]
 
 
 def _scans_of(file: Path) -> Path:

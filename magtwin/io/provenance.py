@@ -122,24 +122,15 @@ def made_again(
 ) -> Run:
     """Reproduce a run from its metadata, or drive the same with another engine or seed.
 
-    Args:
-        run: As for `repeat`.
-        scene: As for `repeat`.
-        near: As for `repeat`.
-        engine: "kinematic" or "newton". Default: the run's engine.
-        seed: Seed of all noise. Default: the run's seed.
-        progress: As for `magtwin.twin.engine_named`.
-
-    Raises:
-        InputError: As for `repeat`; or the engine is unknown or not installed.
+    `run`, `scene`, `near` and errors are those of `repeat`. `engine` is "kinematic" or "newton", `seed` that
+    of all noise; by default those of the run. `progress` is as for `magtwin.twin.engine_named`.
     """
     metadata = run.metadata
     if "seed" not in metadata and seed is None:
         raise InputError(
-            "the metadata hold no seed, so the run cannot be reproduced; was it recorded elsewhere?"
+            "the metadata hold no seed, so it cannot be made again; was the run recorded elsewhere?"
         )
-    twin = twin_of(run, scene, near=near, check=False)
-    twin = in_session_of(twin, metadata)
+    twin = in_session_of(twin_of(run, scene, near=near, check=False), metadata)
     what = _driven(run, near)
     try:
         seed, rate = int(metadata["seed"]) if seed is None else seed, float(metadata["rate_hz"])
@@ -148,9 +139,7 @@ def made_again(
     except (KeyError, ValueError, OverflowError) as error:
         raise InputError(f"the metadata of the run are incomplete: {error}") from error
     if run.rows > 1 and rate * float(run["t"][-1] - run["t"][0]) > _MORE * run.rows:
-        raise InputError(
-            f"rate_hz of the metadata is {rate:g}; the run's {run.rows:,} readings have another rate"
-        )
+        raise InputError(f"rate_hz of the metadata is {rate:g}; the run's {run.rows:,} readings have another")
     moved_by: Any = engine or metadata.get("engine", "kinematic")
     options: dict[str, Any] = {"seed": seed, "speed": speed, "duration_s": asked, "rate_hz": rate}
     options |= {"lidar": metadata.get("lidar", "schedule"), "outside": metadata.get("outside", "nan")}
@@ -195,8 +184,7 @@ def differences(run: Run, again: Run) -> tuple[Difference, ...]:
     """Columns that are not bit-identical in another run; nan equals nan."""
     found = []
     for name, a in run.items():
-        b = again.columns.get(name)
-        if b is None:
+        if (b := again.columns.get(name)) is None:
             found.append(Difference(name, run.rows, 0, np.nan))
             continue
         rows = min(len(a), len(b))
@@ -227,17 +215,15 @@ def _driven(run: Run, near: str | FilePath | None) -> Any:
     for kind, read in (("path", read_path_csv), ("commands", read_commands), ("replay", read_run)):
         if f"{kind}_file" in metadata:
             file = str(metadata[f"{kind}_file"])
-            place = locate(file, near)
-            if place is None:
+            if (place := locate(file, near)) is None:
                 raise InputError(f"{file}: the file that the run drove is missing; put it back")
             return _placed(read(place), run)
     name = str(metadata.get("path", ""))
     if {"replay_sha256", "commands_sha256"} & metadata.keys():
-        text = "which is in no file; it cannot be reproduced from its metadata"
-        raise InputError(f"the run drove {name!r}, {text}")
+        raise InputError(f"the run drove {name!r}, which is in no file; it cannot be reproduced")
     if name in ("random", COVERAGE):  # planned for the room
         return name
-    if name not in PATHS and name not in CASES:
+    if name not in (*PATHS, *CASES):
         raise InputError(f"the run drove the path {name!r}, which is in no file; it cannot be reproduced")
     return _placed(path_named(name), run)
 
@@ -248,7 +234,6 @@ def _placed(driven: Any, run: Run) -> Any:
     if not placing or not isinstance(driven, Path):
         return driven
     try:
-        numbers = tuple(map(float, placing.split()))
-        return driven.placed(numbers)  # type: ignore[arg-type]
+        return driven.placed(tuple(map(float, placing.split())))  # type: ignore[arg-type]
     except ValueError as error:
         raise InputError(f"metadata path_placing must be four numbers, got {placing!r}") from error

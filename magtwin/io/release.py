@@ -70,10 +70,8 @@ def read_release(path: str | os.PathLike[str]) -> Run:
             break
         row = _numbers(frame, where)
         if row[0] < last:
-            raise InputError(
-                f"{where}: its clock goes back from {last!r} to {row[0]!r} s; was it set while recording? "
-                "cut the file in two there"
-            )
+            text = "was it set while recording? cut the file in two there"
+            raise InputError(f"{where}: its clock goes back from {last!r} to {row[0]!r} s; {text}")
         if row[1] == 0.0 or math.isnan(row[1]):
             continue  # a message of another sensor; the next reading holds its values too
         if row[0] == last:
@@ -81,10 +79,10 @@ def read_release(path: str | os.PathLike[str]) -> Run:
         table.extend(row)
         last = row[0]
     if not table:
-        raise InputError(
-            f"{path}: {number - 1} frames, and none carries a reading (nn_magnetic_magnitude is 0 in all); "
-            "was the magnetometer's node running?"
+        text = (
+            "none carries a reading (nn_magnetic_magnitude is 0 in all); was the magnetometer's node running?"
         )
+        raise InputError(f"{path}: {number - 1} frames, and {text}")
     rows = np.frombuffer(table, float).reshape(-1, _WIDTH)
     metadata: dict[str, Any] = {"recording": path.name, "recording_sha256": sha256(path)}
     metadata |= {"frames": number - 1, "start_s": float(rows[0, 0]), "recording_end": frame}
@@ -93,8 +91,8 @@ def read_release(path: str | os.PathLike[str]) -> Run:
 
 def _columns(rows: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
     """Columns of a Run from numbers in the order of `_SIZES`."""
-    parts = np.split(rows, np.cumsum([*_SIZES.values()])[:-1], axis=1)
-    clock, field, on_map, pose, odom, imu, battery, lidar = parts
+    ends = np.cumsum([*_SIZES.values()])[:-1]
+    clock, field, on_map, pose, odom, imu, battery, lidar = np.split(rows, ends, axis=1)
     yaw, q = wrap_angle(pose[:, 2]), canonical(quat_from_yaw(pose[:, 2]))
     p = np.column_stack([pose[:, :2], np.where(np.isfinite(pose[:, 0]), 0.0, np.nan)])
     columns: dict[str, NDArray[Any]] = {
@@ -178,10 +176,8 @@ def _frame(text: str, at: int, number: int, where: str) -> tuple[dict[str, Any] 
         return "without its bracket", at
     if text[at] == "]":
         if rest := text[at + 1 :].strip():
-            raise InputError(
-                f"{where.partition(', frame')[0]}: goes on after the end of its list, with "
-                f"{_quoted(rest[:20])}; are these two recordings? cut them apart"
-            )
+            text = f"with {_quoted(rest[:20])}; are these two recordings? cut them apart"
+            raise InputError(f"{where.partition(', frame')[0]}: goes on after the end of its list, {text}")
         return "whole", at
     if text[at] != "{":
         raise InputError(f"{where}: a frame begins with '{{', this with {text[at]!r}")

@@ -11,6 +11,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -139,8 +140,7 @@ def save_runs(
     """
     if jobs is None and shard is None and dask is None:
         return _save_here(runs, out, force, progress)
-    identity = getattr(runs, "identity", None)
-    if identity is None:
+    if getattr(runs, "identity", None) is None:
         text = "`jobs`, `shard` and `dask` need the runs that magtwin.sweep gives, not a list of runs"
         raise InputError(text, parameter="jobs")
     if shard is not None and force:
@@ -237,8 +237,9 @@ class _Parts:
 
     def _begin(self) -> None:
         """Make the folder, or check that it is of this sweep."""
-        if self._about(self.folder) == self.about:
-            return
+        with suppress(OSError, ValueError):  # missing or damaged
+            if json.loads(read_text(self.folder / ABOUT, "description of a sweep", "JSON")) == self.about:
+                return
         if self.folder.exists() and any(not file.name.startswith(".") for file in self.folder.iterdir()):
             if not self.force:
                 text = "unfinished runs of another sweep; give `force=True` to replace them, or another name"
@@ -259,20 +260,8 @@ class _Parts:
             if self.folder.exists():
                 raise
             return self.out.exists()
-        self._tidy()
-        return True
-
-    def _tidy(self) -> None:
-        """Remove the notes of a finished sweep, sweep.json last."""
         for left in self.out.glob(f".*{HIDDEN}*"):  # of processes that were killed
             shutil.rmtree(left, ignore_errors=True)
-        for file in (*self.out.glob("part-*.json"), self.out / ABOUT):
+        for file in (*self.out.glob("part-*.json"), self.out / ABOUT):  # sweep.json last
             file.unlink(missing_ok=True)
-
-    @staticmethod
-    def _about(folder: Path) -> Any:
-        """What sweep.json in a folder says; None if it cannot be read."""
-        try:
-            return json.loads(read_text(folder / ABOUT, "description of a sweep", "JSON"))
-        except (OSError, ValueError):
-            return None
+        return True

@@ -14,7 +14,7 @@ import warnings
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from tokenize import TokenError
@@ -64,29 +64,29 @@ _CSV_LINE = 1 << 20  # Longest line of a CSV [bytes]; a header of ten thousand c
 def write_parquet(run: Run, path: str | os.PathLike[str], *, force: bool = False) -> None:
     """Write a run, whose clock `t` must ascend, as Parquet; the same run gives the same bytes."""
     check_clock(run, "the run to write")
-    tables = map(table_of, blocks(run))
-    first = next(tables)
     with output(path, force=force) as aside:
-        _write_tables(first, tables, aside)
+        _write(run, aside)
 
 
 def parquet_of(run: Run) -> bytes:
     """The content of the file that `write_parquet` writes; arguments and errors are its own."""
     check_clock(run, "the run to write")
-    tables, sink = map(table_of, blocks(run)), pa.BufferOutputStream()
-    _write_tables(next(tables), tables, sink)
+    sink = pa.BufferOutputStream()
+    _write(run, sink)
     content: bytes = sink.getvalue().to_pybytes()
     return content
 
 
-def _write_tables(first: pa.Table, others: Iterable[pa.Table], where: Any) -> None:
+def _write(run: Run, where: Any) -> None:
     """Write the blocks of a run as groups of rows."""
+    tables = map(table_of, blocks(run))
+    first = next(tables)
     split = {f.name: "BYTE_STREAM_SPLIT" for f in first.schema if pa.types.is_floating(f.type)}
     options: Any = {"compression": "zstd", "use_dictionary": False, "column_encoding": split}
     with pq.ParquetWriter(where, first.schema, **options) as writer:
         writer.write_table(first)
         del first
-        for table in others:
+        for table in tables:
             writer.write_table(table)
 
 
@@ -99,10 +99,13 @@ def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | N
     path = existing(path, "Parquet file")
     try:
         if path.is_dir():
-            return _read_parts(path)
+            parts = sorted(path.glob("part-*.parquet"))
+            if not parts:
+                raise InputError(f"{path}: a folder without Parquet parts; name the file in it")
+            return _joined(path, parts, None)
         about = load_parquet(path, pq.read_metadata)
         if about.num_rows > mapped.LONG:
-            return _read_long(path, [path], columns)
+            return _joined(path, [path], columns)
         if FACTS not in (about.metadata or {}):
             return _others(path, columns)
         table = load_parquet(path)
@@ -114,25 +117,13 @@ def read_parquet(path: str | os.PathLike[str], *, columns: Mapping[str, str] | N
         raise InputError(f"{path}: damaged Parquet (a name is no text); write it again") from error
 
 
-def _read_parts(path: Path) -> Run:
-    parts = sorted(path.glob("part-*.parquet"))
-    if not parts:
-        raise InputError(f"{path}: a folder without Parquet parts; name the file in it")
-    if sum(load_parquet(part, pq.read_metadata).num_rows for part in parts) > mapped.LONG:
-        return _read_long(path, parts, None)
-    tables = [load_parquet(part) for part in parts]
-    for part, table in zip(parts, tables, strict=True):
-        if table.schema != tables[0].schema:
-            raise InputError(f"{part}: has other columns than {parts[0].name}; it belongs to another run")
-    metadata = tables[-1].schema.metadata  # the latest
-    return run_of(pa.concat_tables(tables).replace_schema_metadata(metadata), path)
-
-
-def _read_long(path: Path, files: Sequence[Path], columns: Mapping[str, str] | None) -> Run:
-    """The run in files one after the other, read in blocks into mapped columns."""
+def _joined(path: Path, files: Sequence[Path], columns: Mapping[str, str] | None) -> Run:
+    """The run in files one after the other, read in blocks, with the metadata of the last."""
     abouts = [load_parquet(file, pq.read_metadata) for file in files]
     schemas = [about.schema.to_arrow_schema() for about in abouts]
     spool, rows = Spool(sum(about.num_rows for about in abouts)), 0
+    if not any(about.num_rows for about in abouts):
+        return run_of(load_parquet(files[-1]), path)
 
     def append(file: Path) -> None:
         nonlocal rows
@@ -164,10 +155,8 @@ class ParquetParts:
         self.path = check_free(path, force=force)
         self.folder = Path(f"{self.path}.parts")  # Folder of the parts
         if self.folder.exists() and not force:
-            raise InputError(
-                f"{self.folder}: parts of a run that did not end; magtwin convert reads them; give --force "
-                "to replace them, or another name"
-            )
+            advice = "magtwin convert reads them; give --force to replace them, or another name"
+            raise InputError(f"{self.folder}: parts of a run that did not end; {advice}")
         self._count, self._last = 0, -np.inf
         try:
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -181,12 +170,10 @@ class ParquetParts:
             return
         check_clock(run, "the block to append")
         if run["t"][0] <= self._last:
-            raise InputError(
-                f"the block to append begins at {run['t'][0]:.9g} s, and the last ended at {self._last:.9g} s"
-            )
-        table = table_of(run)
+            begin = f"begins at {run['t'][0]:.9g} s"
+            raise InputError(f"the block to append {begin}, and the last ended at {self._last:.9g} s")
         with output(self.folder / f"part-{self._count:06d}.parquet", at_once=True) as aside:
-            _write_tables(table, (), aside)
+            _write(run, aside)
         self._count, self._last = self._count + 1, run["t"][-1]
 
 
@@ -200,8 +187,7 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
     check_clock(run, "the run to write")
     table = table_of(run.take(slice(0, 1)))
     lines = [f"# {_ABOUT} run: metadata, then columns by name with unit, frame and meaning, in JSON"]
-    lines.append(f"# rows {run.rows}")
-    lines.append(f"# facts {_line_safe(json.loads(metadata_to_json(run)))}")
+    lines += [f"# rows {run.rows}", f"# facts {_line_safe(json.loads(metadata_to_json(run)))}"]
     for field in table.schema:
         about = {key.decode(): text.decode() for key, text in field.metadata.items()}
         lines.append(f"# column {field.name} {_line_safe({'type': str(field.type), **about})}")
@@ -213,8 +199,8 @@ def write_csv(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
 
     with output(path, force=force) as aside, open(aside, "wb") as file:
         file.write(("\n".join(lines) + "\n").encode())
+        bare = csv.WriteOptions(include_header=False, quoting_style="none")
         for block in blocks(run):
-            bare = csv.WriteOptions(include_header=False, quoting_style="none")
             csv.write_csv(table_of(block), file, bare)
 
 
@@ -240,8 +226,7 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
             lines = sum(block.count(b"\n") for block in iter(lambda: file.read(_CSV_LINE), b""))
         check_decoded(path, size, NUMBER * len(names) * lines)
     rows, metadata, said = _csv_about(about, path)
-    if columns:
-        names = _renamed(names, columns, path)
+    names = _renamed(names, columns or {}, path)
     types = {
         name: pa.bool_() if name in COLUMNS and COLUMNS[name].unit == "bool" else pa.float64()
         for name in names
@@ -265,16 +250,13 @@ def read_csv(path: str | os.PathLike[str], *, columns: Mapping[str, str] | None 
         )
         table = csv.read_csv(path, reading, csv.ParseOptions(), conversion)
     except (pa.ArrowException, OSError) as error:
-        reason = _short(" ".join(str(error).split()))
-        fault = InputError(f"{path}: not a CSV file of a run: {reason}")
+        fault = InputError(f"{path}: not a CSV file of a run: {_short(error)}")
         if not said:
             return _others(path, columns, fault)
         raise fault from error
     if rows not in ("", str(table.num_rows)):
-        raise InputError(
-            f"{path}: holds {table.num_rows} rows, but its line '# rows' says {rows[:20]!r}: cut short, or "
-            "edited; copy it again, or remove that line"
-        )
+        text = f"holds {table.num_rows} rows, but its line '# rows' says {rows[:20]!r}"
+        raise InputError(f"{path}: {text}: cut short, or edited; copy it again, or remove that line")
     fields = [f.with_metadata(said.get(f.name) or None) for f in table.schema]
     table = table.cast(pa.schema(fields, metadata={FACTS: metadata}))
     return run_of(table if said else _by_quantity(table, path), path)
@@ -363,8 +345,7 @@ def _on_the_floor(table: pa.Table) -> pa.Table:
 
 def _csv_head(file: io.BufferedReader, path: Path) -> tuple[list[str], list[str], int]:
     """The lines of a CSV that begin with #, its column names, and the number of these lines."""
-    about: list[str] = []
-    held = 0
+    about, held = list[str](), 0
     for count, line in enumerate(iter(lambda: file.readline(_CSV_LINE), b""), 1):
         try:
             text = line.decode("utf-8-sig" if count == 1 else "utf-8").rstrip("\r\n")
@@ -375,9 +356,7 @@ def _csv_head(file: io.BufferedReader, path: Path) -> tuple[list[str], list[str]
         if text.startswith("#"):
             held += len(line)
             if len(about) == _CSV_ABOUT or held > BUDGETS["text"].file:
-                raise InputError(
-                    f"{path}: {len(about):,} lines of comments; remove those that are not needed"
-                )
+                raise InputError(f"{path}: {count:,} lines of comments; remove those that are not needed")
             about.append(text)
         elif text.strip():
             return about, [name.strip().strip('"') for name in text.split(",")], count
@@ -386,17 +365,15 @@ def _csv_head(file: io.BufferedReader, path: Path) -> tuple[list[str], list[str]
 
 def _csv_about(lines: list[str], path: Path) -> tuple[str, str, dict[str, dict[str, str]]]:
     """The number of rows ("" if missing), the metadata as JSON, and the metadata of columns in a CSV."""
-    rows, metadata, said = "", "{}", {}
+    about, said = {"rows": "", "facts": "{}"}, {}
     for number, line in enumerate(lines, 1):
         kind, _, rest = line[1:].strip().partition(" ")
-        if kind == "rows":
-            rows = rest
-        elif kind == "facts":
-            metadata = rest
-        elif kind == "column":
+        if kind == "column":
             name, _, text = rest.partition(" ")
             said[name] = _texts(text, f"{path}:{number}")
-    return rows, metadata, said
+        else:
+            about[kind] = rest
+    return about["rows"], about["facts"], said
 
 
 def _texts(text: str, where: str) -> dict[str, str]:
@@ -416,7 +393,8 @@ def _line_safe(value: Any) -> str:
     return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
 
 
-def _short(text: str) -> str:
+def _short(error: BaseException) -> str:
+    text = " ".join(str(error).split())
     return text if len(text) <= 200 else text[:200] + " ..."
 
 
@@ -433,19 +411,15 @@ def write_npz(run: Run, path: str | os.PathLike[str], *, force: bool = False) ->
         name: {**said_of(run.spec(name), name), "parts": ",".join(run.spec(name).parts)} for name in run
     }
     about = json.dumps({"facts": json.loads(metadata_to_json(run)), "columns": columns}, ensure_ascii=False)
-    with output(path, force=force) as aside, open(aside, "wb") as file:
-        if run.rows <= mapped.LONG:
-            np.savez(file, allow_pickle=False, **{_ABOUT: np.array(about)}, **run.columns)
-            return
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
-            for name, values in {_ABOUT: np.array(about), **run.columns}.items():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                    _write_array(member, values)
+    with output(path, force=force) as aside, zipfile.ZipFile(aside, "w") as archive:
+        for name, values in {_ABOUT: np.array(about), **run.columns}.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                _write_array(member, values)
 
 
 def _write_array(member: Any, values: NDArray[Any]) -> None:
-    """Write an array as numpy does, block by block."""
-    if not values.ndim:
+    """Write an array as numpy does, a long one block by block."""
+    if not values.ndim or len(values) <= mapped.LONG:
         np.lib.format.write_array(member, values, allow_pickle=False)
         return
     head = np.lib.format.header_data_from_array_1_0(values)
@@ -484,10 +458,8 @@ def read_npz(path: str | os.PathLike[str]) -> Run:
     }
     for name, values in arrays.items():
         if values.dtype.kind not in "bfiu" or values.ndim not in (1, 2):
-            raise InputError(
-                f"{path}: column {name!r} must hold numbers or flags in rows, got {values.dtype} "
-                f"of shape {values.shape}"
-            )
+            got = f"{values.dtype} of shape {values.shape}"
+            raise InputError(f"{path}: column {name!r} must hold numbers or flags in rows, got {got}")
     try:
         run = Run(arrays, metadata, specs)
     except (InputError, TypeError) as error:
@@ -503,8 +475,7 @@ def _array(archive: zipfile.ZipFile, name: str, path: Path) -> NDArray[Any]:
             file.seek(0)
             return np.lib.format.read_array(file, allow_pickle=False)  # type: ignore[arg-type]
     except (ValueError, MemoryError, OverflowError, SyntaxError, TokenError) as error:
-        reason = _short(" ".join(str(error).split()))
-        raise InputError(f"{path}: {name} is no whole array of plain numbers ({reason})") from error
+        raise InputError(f"{path}: {name} is no whole array of plain numbers ({_short(error)})") from error
 
 
 def _check_header(file: IO[bytes], size: int) -> None:

@@ -20,11 +20,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from magtwin.errors import InputError
 
-LONG = 1 << 19
-"""Most rows that are kept in memory: an hour at 135 Hz."""
-
-BLOCK = 1 << 16
-"""Rows of a longer run that are worked on at a time."""
+LONG = 1 << 19  # Most rows that are kept in memory: an hour at 135 Hz
+BLOCK = 1 << 16  # Rows of a longer run that are worked on at a time
 
 _maps: "weakref.WeakSet[mmap.mmap]" = weakref.WeakSet()
 """Mapped files of all arrays that are in use."""
@@ -43,10 +40,8 @@ def zeros(shape: int | tuple[int, ...], dtype: DTypeLike = float) -> NDArray[Any
     folder = _folder()
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
-            if hasattr(os, "posix_fallocate"):
-                os.posix_fallocate(
-                    file.fileno(), 0, size
-                )  # a full disk later would be a signal, not an error
+            if hasattr(os, "posix_fallocate"):  # a full disk later would be a signal, not an error
+                os.posix_fallocate(file.fileno(), 0, size)
             else:
                 file.truncate(size)
             content = mmap.mmap(file.fileno(), size)

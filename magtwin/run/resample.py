@@ -18,8 +18,7 @@ from magtwin.run import mapped
 Array = NDArray[np.float64]
 Interpolation = Literal["linear", "hold", "angle", "quaternion"]
 
-MOST_ROWS = 50_000_000
-"""Largest number of times in a grid."""
+MOST_ROWS = 50_000_000  # Largest number of times in a grid
 
 
 def bracket(t: Array, at: Array) -> tuple[NDArray[np.intp], Array]:

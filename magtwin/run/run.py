@@ -27,11 +27,8 @@ if TYPE_CHECKING:
 
 Metadata = Mapping[str, str | int | float | bool]
 
-LAST_S = 9.2e9
-"""Latest time of a run, and minus the earliest [s]: 64 bits of nanoseconds, as viewers and bags count."""
-
-LARGEST = 1e30
-"""Largest finite number in a column of a file: its square and its 32-bit form are finite too."""
+LAST_S = 9.2e9  # Latest time of a run, and minus the earliest [s]: 64 bits of nanoseconds, as in bags
+LARGEST = 1e30  # Largest finite number in a column of a file: its square and its 32-bit form are finite too
 
 
 @dataclass(frozen=True)

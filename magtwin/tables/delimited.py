@@ -58,7 +58,6 @@ _SUMMARY = re.compile(
 """Begin of a row below a table that sums it up."""
 
 _BELOW_1000 = re.compile(r"\s*[+-]?\d{1,3}([.,]\d*)?\s*", re.ASCII)
-
 _BEGUN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d*)?([eE][+-]?)?", re.ASCII)  # The begin of a number
 
 _SLASH = re.compile(r"\s*/([^\w,;]|\w+\s|$)")
@@ -73,9 +72,7 @@ _CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f]")  # Characters that no text has
 _Lines = list[tuple[int, str]]  # Number and text of lines
 _Rows = list[tuple[int, list[str]]]  # Line and words of rows
 
-
 _PLACED = ("x", "y", "heading")  # A header names one, if prose above it looks like another header
-
 _UNITS = frozenset(unit.replace("_", "") for unit in UNITS)
 
 
@@ -151,16 +148,6 @@ def number_of(word: str) -> float:
     return math.nan if word.strip().lower() in MISSING or _ERROR.fullmatch(word) else -math.inf
 
 
-def _is_cut_short(column: Sequence[str]) -> bool:
-    """Whether the last number of a column has lost its end: it is shorter and far less than all others."""
-    *others, last = column
-    if len(others) < LEAST_ROWS or not math.isfinite(value := number_of(last)):
-        return False
-    if len(last.strip()) >= min(len(word.strip()) for word in others):
-        return False
-    return LOST * abs(value) < min((abs(v) for v in map(number_of, others) if math.isfinite(v)), default=0.0)
-
-
 def _is_number(word: str) -> bool:
     """Whether a word is a number, perhaps with a decimal comma or marks between thousands."""
     return math.isfinite(number_of(word)) or bool(_COMMA.fullmatch(word) or _THOUSANDS.fullmatch(word))
@@ -175,9 +162,8 @@ def _is_text(word: str) -> bool:
 
 def _is_header(words: list[str]) -> bool:
     """Whether a word of the first row is not a number, and none is one with a comma."""
-    return any(map(_is_text, words)) and not any(
-        _COMMA.fullmatch(w) or _THOUSANDS.fullmatch(w) for w in words
-    )
+    numbers = any(_COMMA.fullmatch(word) or _THOUSANDS.fullmatch(word) for word in words)
+    return any(map(_is_text, words)) and not numbers
 
 
 def _header(rows: _Rows) -> int:
@@ -264,9 +250,8 @@ def _is_units(rows: list[list[str]], width: int) -> bool:
 def _with_unit(name: str, word: str) -> str:
     """The name of a column with its unit, unless it has one or the word is missing."""
     unit = word.strip(" []()")
-    has_unit = bool(split_label(name).unit) or any(
-        meaning.unit for role in _PLACED if (meaning := meaning_of(name, role))
-    )
+    meanings = filter(None, (meaning_of(name, role) for role in _PLACED))
+    has_unit = bool(split_label(name).unit) or any(meaning.unit for meaning in meanings)
     return f"{name} [{unit}]" if name and _is_text(unit) and not has_unit else name
 
 
@@ -276,14 +261,11 @@ def _without_comments(lines: _Lines, notes: list[str]) -> tuple[_Lines, _Lines, 
     lines = lines[1:] if match else lines
     slashed = any(_SLASH.match(line) for _, line in lines[:MOST_ABOVE])
     others = [(number, line) for number, line in lines if not _is_comment(line, slashed)]
-    above = [
-        (number, text.lstrip(text[0]))
-        for number, text in ((number, line.strip()) for number, line in lines if _is_comment(line, slashed))
-        if re.search(r"\w", text) and not _REMARK.match(text)
-    ]
+    texts = [(number, line.strip()) for number, line in lines if _is_comment(line, slashed)]
+    texts = [(number, text) for number, text in texts if re.search(r"\w", text) and not _REMARK.match(text)]
+    above = [(number, text.lstrip(text[0])) for number, text in texts]
     comments = [row for row in lines if row[1].lstrip().startswith("#") and _is_comment(row[1])]
-    tracks = [line.strip() for _, line in others if _TRACK.fullmatch(line)]
-    if tracks:
+    if tracks := [line.strip() for _, line in others if _TRACK.fullmatch(line)]:
         notes.append(f"lines such as {tracks[0][:QUOTED]!r} left out: {len(tracks)}")
         others = [(number, line) for number, line in others if not _TRACK.fullmatch(line)]
     return comments, above, others, match[1] if match else ""
@@ -324,9 +306,8 @@ def _lines(path: Path, text: str) -> tuple[_Lines, bool]:
     lines = list(enumerate(text.split("\n"), 1))
     for number, line in lines:
         if len(line) > LONGEST_LINE:
-            raise InputError(
-                f"{path}:{number}: longer than {LONGEST_LINE:,} characters; this is no row of numbers"
-            )
+            text = f"longer than {LONGEST_LINE:,} characters; this is no row of numbers"
+            raise InputError(f"{path}:{number}: {text}")
     return [(number, line) for number, line in lines if line.strip()], not lines[-1][1].strip()
 
 
@@ -390,9 +371,8 @@ def _plain_numbers(names: list[str], rows: list[list[str]], between: str | None,
     """Take marks between thousands and directions out of the rows, and make decimal commas points."""
     for column in range(len(rows[0])):
         found = [_COMPASS.fullmatch(row[column].strip()) for row in rows]
-        if all(found):
-            for row, match in zip(rows, found, strict=True):
-                row[column] = ("-" if match and match[2] in "WS" else "") + (match[1] if match else "")
+        for row, match in zip(rows, found, strict=True) if all(found) else ():
+            row[column] = ("-" if match and match[2] in "WS" else "") + (match[1] if match else "")
     if columns := _without_thousands(rows):
         named = ", ".join(names[k] if names else str(k + 1) for k in columns)
         notes.append(f"numbers of {named[:QUOTED]} with marks between thousands")
@@ -406,10 +386,15 @@ def _plain_numbers(names: list[str], rows: list[list[str]], between: str | None,
 
 
 def _without_begun(number: int, rows: list[list[str]], notes: list[str]) -> None:
-    """Take out the last number of a last line without an end, if it lost its own end."""
-    last = rows[-1][-1].strip()
-    begun = len(rows) > 1 and _is_text(last) and _BEGUN.fullmatch(last) and _is_number(rows[-2][-1])
-    if begun or _is_cut_short([row[-1] for row in rows]):
+    """Take out the last number of a last line without an end, if it lost its own end.
+
+    It begins a number, or is shorter and far less than all others.
+    """
+    *others, last = (row[-1].strip() for row in rows)
+    begun = others and _is_text(last) and _BEGUN.fullmatch(last) and _is_number(others[-1])
+    sizes = [abs(value) for value in map(number_of, others) if math.isfinite(value)]
+    shorter = len(others) >= LEAST_ROWS and len(last) < min(map(len, others))
+    if begun or (shorter and LOST * abs(number_of(last)) < min(sizes, default=0.0)):
         why = "begins a number" if begun else "is far below all other values"
         notes.append(f"line {number} as cut short and left out: it has no end, and its {last[:QUOTED]} {why}")
         rows[-1][-1] = ""
@@ -420,22 +405,18 @@ def _without_thousands(rows: list[list[str]]) -> list[int]:
 
     A comma is between thousands if a number has a point after it, or two of them; else it may be decimal.
     """
-    found = {
-        k: match["mark"]
-        for row in rows
-        for k, word in enumerate(row)
-        if len(word) > 4 and (match := _THOUSANDS.fullmatch(word))
-    }
+    found = dict[int, str]()
+    for k, word in (cell for row in rows for cell in enumerate(row)):
+        if len(word) > 4 and (match := _THOUSANDS.fullmatch(word)):
+            found[k] = match["mark"]
     columns = []
     for k, mark in found.items():
         words = [row[k] for row in rows]
         matches = [_THOUSANDS.fullmatch(word) for word in words]
-        fits = all(
-            match["mark"] == mark
-            if match
-            else math.isnan(number_of(word)) or (mark not in word.strip() and _BELOW_1000.fullmatch(word))
-            for word, match in zip(words, matches, strict=True)
-        )
+        plain = [word for word, match in zip(words, matches, strict=True) if not match]
+        plain = [word for word in plain if not math.isnan(number_of(word))]
+        fits = all(match["mark"] == mark for match in matches if match)
+        fits &= all(mark not in word.strip() and _BELOW_1000.fullmatch(word) for word in plain)
         ends = {match["rest"][0] for match in matches if match and match["rest"]}
         sure = mark != "," or "." in ends or any(word.count(mark) > 1 for word in words)
         if fits and sure and mark not in ends:

@@ -7,12 +7,8 @@ from typing import NamedTuple
 from magtwin.tables.quantities import IN_BRACKETS, QUANTITIES, UNITS
 
 _SIGNS = str.maketrans(
-    {
-        "\N{DEGREE SIGN}": "deg",
-        "\N{MASCULINE ORDINAL INDICATOR}": "deg",
-        "\N{MICRO SIGN}": "u",
-        "\N{GREEK SMALL LETTER MU}": "u",
-    }
+    dict.fromkeys("\N{DEGREE SIGN}\N{MASCULINE ORDINAL INDICATOR}", "deg")
+    | dict.fromkeys("\N{MICRO SIGN}\N{GREEK SMALL LETTER MU}", "u")
 )
 _BRACKETS = re.compile(r"[\[\]()]")
 _LEFT_OUT = ("in", "per")  # Words between a name and its unit, and in a unit

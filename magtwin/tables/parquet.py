@@ -90,16 +90,12 @@ def check_parquet(path: Path) -> None:
         check_count(path, "Parquet", about.num_columns, "columns")
         columns = [about.schema.column(i) for i in range(about.num_columns)]
         _check_pages(path, size)
-        lists = [i for i, column in enumerate(columns) if column.max_repetition_level]
-        values = 8 * about.num_rows * (len(columns) - len(lists))
-        if lists:
-            counts = _counts(path)
-            values += 8 * sum(count for group in counts for i, count in enumerate(group) if i in lists)
+        values = 8 * about.num_rows * sum(not column.max_repetition_level for column in columns)
+        for group in _counts(path):
+            for column, count in zip(columns, group, strict=False):
+                values += 8 * count if column.max_repetition_level else 0
+                values += column.length * count if column.physical_type == _FIXED else 0
         check_decoded(path, size, values)
-        fixed = {i: column.length for i, column in enumerate(columns) if column.physical_type == _FIXED}
-        if fixed:
-            values += sum(fixed.get(i, 0) * count for group in _counts(path) for i, count in enumerate(group))
-            check_decoded(path, size, values)
     texts = [column.path for column in columns if column.physical_type == "BYTE_ARRAY"]
     # As dictionaries, since a large text of a dictionary can be in every row.
     with pq.ParquetFile(path, read_dictionary=texts) as file:

@@ -37,12 +37,9 @@ FIELDS = {
     **dict.fromkeys(("nt", "nanotesla", "nanoteslas", "gamma", "gammas"), 1.0),
     **dict.fromkeys(("ut", "microtesla", "microteslas"), 1e3),
     "mt": 1e6,
-    "t": 1e9,
-    "tesla": 1e9,
-    "mg": 1e2,
-    "milligauss": 1e2,
-    "g": 1e5,
-    "gauss": 1e5,
+    **dict.fromkeys(("t", "tesla"), 1e9),
+    **dict.fromkeys(("mg", "milligauss"), 1e2),
+    **dict.fromkeys(("g", "gauss"), 1e5),
 }
 """nT per unit of the magnetic field."""
 
@@ -70,10 +67,9 @@ IN_BRACKETS = frozenset({"t", "g", "min", "h"})
 class Quantity:
     """What a column may hold."""
 
+    # Its names, the usual one first, in lower case with low lines between words, and `|` between equals.
+    # Those of one place belong together in quantities of one kind, as easting and northing.
     names: str
-    """Its names, the usual one first, in lower case with low lines between words, and `|` between equals.
-    Those of one place belong together in quantities of one kind, as easting and northing."""
-
     units: Mapping[str, float]  # Factors to SI units or nT, by unit in lower case
     beside: str = ""  # Words before or behind a name that say where it comes from
 

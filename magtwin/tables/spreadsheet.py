@@ -16,9 +16,8 @@ def text_of_spreadsheet(path: Path) -> bytes:
     try:
         from python_calamine import CalamineError, CalamineWorkbook
     except ImportError:
-        raise InputError(
-            f"{path}: a spreadsheet needs python-calamine: pip install 'magtwin[tables]', or save it as CSV"
-        ) from None
+        advice = "pip install 'magtwin[tables]', or save it as CSV"
+        raise InputError(f"{path}: a spreadsheet needs python-calamine: {advice}") from None
     try:
         book = CalamineWorkbook.from_path(path)
         sheets = [book.get_sheet_by_name(name).to_python() for name in book.sheet_names]

@@ -36,7 +36,6 @@ _DAYS = ("%Y-%m-%d", "%d-%m-%Y", "%m-%d-%Y", "%d-%b-%Y")  # Orders of a date, wi
 _CLOCKS = ("", " %H:%M", " %H:%M:%S", " %H:%M:%S.%f", " %I:%M %p", " %I:%M:%S %p")  # Times behind a date
 _READ = "2025-11-22T08:26:40"  # A date as an error message shows it
 
-
 _MELTED = (("variable", "name", "key", "quantity", "channel", "signal", "parameter"), ("value", "values"))
 """Names of the columns of a table with a row for each value: of its quantity, and of the value."""
 
@@ -146,13 +145,12 @@ class Table:
             values = column.cells.astype(float)
         else:
             values = np.array([number_of(cell) for cell in column.cells])
-        wrong = np.flatnonzero(np.isinf(values))
-        if len(wrong):
-            row = int(wrong[0])
+        if (wrong := np.isinf(values)).any():
+            row = int(wrong.argmax())
             cell = column.cells[row]
             shown = repr(cell.strip()[:QUOTED]) if isinstance(cell, str) else values[row]
-            mark = "; a decimal comma is read where no number has a point, and no comma separates cells"
-            advice = mark if "," in str(shown) else ""
+            advice = "; a decimal comma is read where no number has a point, and no comma separates cells"
+            advice *= "," in str(shown)
             raise InputError(f"{column.where(row)}: {name} must be a finite number, got {shown}{advice}")
         return factor * values
 
@@ -165,11 +163,8 @@ class Table:
             notes.append(f"{_and(labels)} as {wanted}")
         elif labels != sorted(labels, key=self.names.index):
             notes.append(f"{wanted} by their names")
-        if some := [
-            label
-            for symbol, label in columns.items()
-            if QUANTITIES[symbol].units.get(self.unit(label, symbol), 1.0) != 1
-        ]:
+        units = {label: QUANTITIES[k].units.get(self.unit(label, k), 1.0) for k, label in columns.items()}
+        if some := [label for label, factor in units.items() if factor != 1]:
             notes.append(f"{_and(some)} by the units in their names")
         if left := [column.name for column in self.columns if column.name and column.name not in labels]:
             notes.append(f"{wanted}, and left out {listed(left)}")
@@ -211,10 +206,8 @@ class Table:
     def beside(self, other: "Table") -> "Table":
         """This table with the columns of another, of as many rows, on the right."""
         if self.rows != other.rows:
-            raise InputError(
-                f"{other.path}: {other.rows} rows, but {self.path} has {self.rows}; "
-                "files joined side by side need one row per reading each"
-            )
+            text = "files joined side by side need one row per reading each"
+            raise InputError(f"{other.path}: {other.rows} rows, but {self.path} has {self.rows}; {text}")
         return Table(self.columns + other.columns, self.notes + other.notes, self.comments)
 
 

@@ -135,6 +135,21 @@ def test_a_survey_whose_sensor_was_stuck_throughout_is_refused_unless_it_is_to_b
     assert load_map(tmp_path / "a.usdc").valid.all()
 
 
+def test_a_sensor_whose_vector_turns_is_not_stuck_though_its_magnitude_stays_to_the_last_digit(tmp_path):
+    (tmp_path / "a.csv").write_text(
+        "t,x,y,yaw,b_nt,bx,by,bz\n"
+        + "".join(
+            f"{k},{k % 15 / 5},{k // 15 / 5},{k % 4 * np.pi / 2},50000,"
+            f"{30_000 * np.cos(k % 4 * np.pi / 2)},{-30_000 * np.sin(k % 4 * np.pi / 2)},-40000\n"
+            for k in range(150)
+        )
+    )
+    options = ("--field", "b_nt", "--vector", "bx,by,bz")
+    run("map", "import", tmp_path / "a.csv", "--out", tmp_path / "a.parquet", *options)
+    run("map", "fit", tmp_path / "a.parquet", "--method", "trilinear", "--out", tmp_path / "a.usdc")
+    assert_allclose(load_map(tmp_path / "a.usdc").lookup([1.0, 1.0], 0.0), 50_000, rtol=1e-9)
+
+
 def test_repeats_of_a_fast_logger_are_counted_and_a_fit_that_lacks_readings_names_the_masked(
     tmp_path, capsys
 ):

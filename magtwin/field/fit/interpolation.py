@@ -72,7 +72,7 @@ def check_readings(readings: Readings) -> None:
     if count < LEAST:
         raise InputError(f"{count} good readings {of}{masked_words(readings)}; a map needs {LEAST} at least")
     p, b = readings.p_xy[good], readings.b_nt[good]
-    if np.ptp(b) == 0:
+    if np.ptp(b if readings.b_body_nt is None else readings.b_body_nt[good], axis=0).max() == 0:
         raise InputError(f"all {count} good readings {of} are {b[0]:.10g} nT: a stuck sensor; survey again")
     spans = np.linalg.svd(p - p.mean(axis=0), compute_uv=False)
     if not spans[1] > 1e-6 * spans[0] + EDGE:

@@ -11,8 +11,7 @@ if TYPE_CHECKING:
     from magtwin.io.bags.writer import RawBagWriter as RawBagWriter
     from magtwin.io.bags.writer import write_bag as write_bag
 
-_MODULES = {"read_bag": "reader"}
-_MODULES |= dict.fromkeys(("RawBagWriter", "write_bag"), "writer")
+_MODULES = {"read_bag": "reader", "RawBagWriter": "writer", "write_bag": "writer"}
 
 __all__ = ["RawBagWriter", "read_bag", "write_bag"]
 

@@ -69,9 +69,8 @@ class Bag:
         for topic in reader.topics:
             known = self.topics.setdefault(topic.topic, topic)
             kind = topic.kind or kinds.get(topic.topic, "")
-            if self.kinds.setdefault(topic.topic, kind) != kind:
-                both = f"{self.kinds[topic.topic]} and {kind}"
-                raise InputError(f"topic {topic.topic} has two types, {both}")
+            if (first := self.kinds.setdefault(topic.topic, kind)) != kind:
+                raise InputError(f"topic {topic.topic} has two types, {first} and {kind}")
             if known.encoding != topic.encoding:
                 raise InputError(f"topic {topic.topic} is encoded as {known.encoding} and {topic.encoding}")
         for kind, (encoding, text) in reader.definitions.items():
@@ -83,11 +82,12 @@ class Bag:
 
     def _tell(self) -> None:
         """Warn of parts that were found to be damaged since the last time."""
-        lost, chunks = sum(len(reader.damaged) for reader in self.readers), self.chunks
-        if lost > self._told:
-            self._told = lost
-            of = f" of {chunks}" if chunks else ""
-            text = f"{lost}{of} chunks or records are damaged and are left out; copy it again if you can"
+        if self.damaged > self._told:
+            self._told = self.damaged
+            of = f" of {self.chunks}" if self.chunks else ""
+            text = (
+                f"{self.damaged}{of} chunks or records are damaged and are left out; copy it again if you can"
+            )
             warnings.warn(f"{self.path}: {text}", RepairWarning, stacklevel=4)
 
     @property
@@ -144,8 +144,8 @@ class Bag:
 
     def missing(self, name: str) -> InputError:
         """The refusal of a topic that is not in the bag."""
-        near = hint(name, self.kinds)
-        near = near + "; " if near.startswith("did you mean") else ""
+        near = f"{hint(name, self.kinds)}; "
+        near = near if near.startswith("did you mean") else ""
         return InputError(f"{self.path}: no topic {name}; {near}topics in it: {self.listed()}")
 
     def listed(self) -> str:

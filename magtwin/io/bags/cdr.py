@@ -32,11 +32,9 @@ class Leaf:
     """A number, stamp or string of a message, or several of them in a row."""
 
     name: str  # Path in the message, such as `pose.position`
-
+    # numpy code of a number; `time` for int32 seconds and uint32 nanoseconds; `text`; or `none` for a
+    # sequence that must be empty
     kind: str
-    """numpy code of a number; `time` for int32 seconds and uint32 nanoseconds; `text`; or `none` for a
-    sequence that must be empty."""
-
     count: int | None = 1  # How many in a row. None: a sequence, whose length stands in the message.
 
 
@@ -80,30 +78,29 @@ def encode(leaves: Sequence[Leaf], fields: Mapping[str, Any], rows: int, *, room
     numbers: list[tuple[int, str, NDArray[Any]]] = []
     texts: list[tuple[int, bytes]] = []
     at = 0
+
+    def put(length: int, content: bytes = b"") -> None:
+        nonlocal at
+        texts.append((_aligned(at, 4), np.uint32(length).tobytes() + content))
+        at = _aligned(at, 4) + 4 + len(content)
+
     for leaf in leaves:
         value = fields.get(leaf.name)
         if leaf.kind == "none":
-            at = _aligned(at, 4) + 4
+            put(0)
             continue
         if leaf.kind == "text":
             words = ("" if value is None else value,) if leaf.count else tuple(value or ())
             if leaf.count is None:
-                at = _aligned(at, 4)
-                texts.append((at, np.uint32(len(words)).tobytes()))
-                at += 4
-            for word in words:
-                encoded = word.encode() + b"\0"
-                at = _aligned(at, 4)
-                texts.append((at, np.uint32(len(encoded)).tobytes() + encoded))
-                at += 4 + len(encoded)
+                put(len(words))
+            for encoded in (word.encode() + b"\0" for word in words):
+                put(len(encoded), encoded)
             continue
         array = np.zeros((1, leaf.count or 0)) if value is None else np.asarray(value)
         count = leaf.count
         if count is None:
             count = array.shape[-1]
-            at = _aligned(at, 4)
-            texts.append((at, np.uint32(count).tobytes()))
-            at += 4
+            put(count)
             if not count:
                 continue
         kind, size = ("u4", 4) if leaf.kind == "time" else (leaf.kind, np.dtype(leaf.kind).itemsize)
@@ -137,7 +134,7 @@ def decode(leaves: Sequence[Leaf], messages: Messages, wanted: Iterable[str]) ->
     [ns]; strings a list of M, and sequences of strings of M tuples. A message that is too short for its type,
     or has another encoding, is refused.
     """
-    left, values_of = set(wanted), {}
+    left, values_of = set(wanted), dict[str, Any]()
     head = 0 if messages.packed else HEADER
     raw = _Raw(messages.buffer, messages.start + head, messages.size - head, messages.packed)
     if np.any(raw.room < 0):
@@ -241,9 +238,8 @@ def _texts(leaf: Leaf, raw: _Raw, at: Index, wanted: bool) -> tuple[list[Any], I
         some = raw.rows(rows)
         begins, after = _text(leaf, some, at[rows])
         if wanted:
-            for row, word in zip(
-                rows, _strings(raw.buffer, some.body + begins, some.body + after), strict=True
-            ):
+            found = _strings(raw.buffer, some.body + begins, some.body + after)
+            for row, word in zip(rows, found, strict=True):
                 words[row].append(word)
         at = at.copy()
         at[rows] = after

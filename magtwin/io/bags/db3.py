@@ -10,10 +10,10 @@ import numpy as np
 import yaml
 
 from magtwin.errors import InputError
-from magtwin.files.budget import BUDGETS, check_decoded
+from magtwin.files.budget import BUDGETS
 from magtwin.files.settings import yaml_loader
 from magtwin.io.bags.cdr import Index, Messages
-from magtwin.io.bags.storage import StoredTopic
+from magtwin.io.bags.storage import StoredTopic, gathered
 
 _STEPS, _STEP = 1_000_000, 10_000  # Steps of sqlite's machine that any file may take, and between counts
 
@@ -61,21 +61,10 @@ class Db3Reader:
 
     def messages(self, ids: Collection[int], most: int | None = None) -> dict[int, Messages]:
         """The messages of some topics in the order of receipt; of about the first `most` bytes."""
-        found = {number: (array("q"), array("q"), bytearray()) for number in ids}
-        query = (
-            f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({', '.join('?' * len(ids))})"
-        )
-        held = self._steps = 0
-        for number, received, data in self._database.execute(query, list(ids)):
-            times, sizes, contents = found[number]
-            held += len(data)  # rows of a damaged file can share their pages
-            if most is not None and held > most:
-                break
-            check_decoded(self._path, self._size, held)
-            times.append(received)
-            sizes.append(len(data))
-            contents += data
-        return {number: Messages.of(*parts) for number, parts in found.items()}
+        marks = ", ".join("?" * len(ids))
+        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks})"
+        self._steps = 0
+        return gathered(self._path, self._database.execute(query, list(ids)), ids, most)
 
     def _spent(self) -> bool:
         """Whether sqlite has to give up."""

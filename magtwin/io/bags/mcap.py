@@ -166,8 +166,8 @@ class McapWriter:
 
     def _put_chunk(self, first: int, last: int, content: Bytes, raw: bytes, index: dict[int, Any]) -> None:
         begin = self._file.tell()
-        crc = zlib.crc32(content.data)
-        self._file.write(_bytes(records.Chunk("zstd", raw, last, first, crc, len(content))))
+        chunk = records.Chunk("zstd", raw, last, first, zlib.crc32(content.data), len(content))
+        self._file.write(_bytes(chunk))
         end = self._file.tell()
         offsets, indexes = {}, b""
         for channel, entries in index.items():
@@ -303,10 +303,10 @@ class McapReader:
                 held += len(content)
                 check_decoded(self._path, self._size, held)
                 parts.append((content, found))
-        buffer = np.concatenate([raw for raw, _ in parts]) if parts else np.zeros(0, np.uint8)
+        buffer = np.concatenate([np.zeros(0, np.uint8), *(raw for raw, _ in parts)])
         bases = np.cumsum([0] + [len(raw) for raw, _ in parts])
         table = [rows + np.array([0, 0, base, 0]) for (_, rows), base in zip(parts, bases, strict=False)]
-        rows = np.concatenate(table) if table else np.zeros((0, 4), np.int64)
+        rows = np.concatenate([np.zeros((0, 4), np.int64), *table])
         joined = {}
         for number in ids:
             _, received, start, size = rows[rows[:, 0] == number].T
@@ -341,10 +341,10 @@ class McapReader:
                     self._learn(opcode, content)
                 elif opcode == Opcode.CHUNK_INDEX:
                     chunk = records.ChunkIndex.read(ReadDataStream(BytesIO(content)))
-                    self._chunks[chunk.chunk_start_offset + _HEAD.size] = chunk.chunk_length - _HEAD.size
+                    place = chunk.chunk_start_offset + _HEAD.size
+                    self._chunks[place] = chunk.chunk_length - _HEAD.size
+                    self._spans[place] = chunk.message_start_time, chunk.message_end_time
                     self.compression.add(chunk.compression)
-                    begin_end = chunk.message_start_time, chunk.message_end_time
-                    self._spans[chunk.chunk_start_offset + _HEAD.size] = begin_end
             except _DAMAGED:
                 return begin, False
             at += length
@@ -369,8 +369,7 @@ class McapReader:
                 self._indexes.extend((body, length, place))
             elif opcode == Opcode.MESSAGE and length >= ROOM - _HEAD.size:
                 channel, _, received = struct.unpack_from("<HIq", head, _HEAD.size)
-                numbers = channel, received, at + ROOM, length - (ROOM - _HEAD.size)
-                self._loose.extend(numbers)
+                self._loose.extend((channel, received, at + ROOM, length - (ROOM - _HEAD.size)))
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
                 try:
                     self._learn(opcode, self._at(body, length))
@@ -435,7 +434,7 @@ class McapReader:
                 self.damaged.add(place)
                 return None
             raise InputError(
-                f"a chunk claims {size} bytes, compressed to {len(raw)} ({codec[:8]}); not supported"
+                f"a chunk claims {size} bytes, packed into {len(raw)} ({codec[:8]}); not supported"
             )
         self._spare -= max(0, size - MOST_RATIO * len(raw))
         try:

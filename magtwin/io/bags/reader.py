@@ -68,9 +68,7 @@ def read_bag(
     with Bag(Path(path)) as bag, np.errstate(over="ignore", invalid="ignore"):
         if READING.name in bag.kinds and NAMES.name in bag.kinds and not topics:
             if unit or scale is not None:
-                raise InputError(
-                    f"{bag.path}: magtwin wrote it and it holds its unit; drop {unit or scale!r}"
-                )
+                raise InputError(f"{bag.path}: magtwin wrote it, with its unit; drop {unit or scale!r}")
             if (run := _own(bag)) is not None:
                 return run
         recording = Recording(bag, topics or {}, survey=survey)
@@ -85,9 +83,9 @@ def _own(bag: Bag) -> Run | None:
     messages = bag.messages((READING.name, NAMES.name, *carriers))
     rows = messages[READING.name]
     texts = decode(layout(NAMES.kind), messages[NAMES.name], ["data"])["data"]
-    if not texts and bag.damaged:
-        return None
     if not texts:
+        if bag.damaged:
+            return None
         raise InputError(f"{bag.path}: a recording into which nothing was written yet")
     table = json.loads(texts[0])
     data = decode(layout(READING.kind), rows, ["data"])["data"]
@@ -140,6 +138,5 @@ def _check_kinds(bag: Bag, topics: Iterable[Topic]) -> None:
         if topic.name not in bag.kinds:
             raise bag.missing(topic.name)
         if bag.kinds[topic.name] != topic.kind:
-            raise InputError(
-                f"{bag.path}: topic {topic.name} is a {bag.kinds[topic.name]}, not a {topic.kind}"
-            )
+            kind = bag.kinds[topic.name]
+            raise InputError(f"{bag.path}: topic {topic.name} is a {kind}, not a {topic.kind}")

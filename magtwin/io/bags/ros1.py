@@ -1,15 +1,13 @@
 """ros1: bags of ROS 1 (.bag), read by rosbags; their messages are decoded like those of ROS 2."""
 
-from array import array
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from magtwin.files.budget import check_decoded
 from magtwin.io.bags.cdr import Index, Messages
-from magtwin.io.bags.storage import StoredTopic
+from magtwin.io.bags.storage import StoredTopic, gathered
 
 _NOW = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}  # Types that have another name today
 
@@ -23,7 +21,7 @@ class Ros1Reader:
     def __init__(self, path: Path) -> None:
         from rosbags.rosbag1 import Reader
 
-        self._path, self._size = path, path.stat().st_size
+        self._path = path
         self._bag: Any = Reader(path)
         self._bag.open()
         self.notes: dict[str, str] = {}
@@ -43,24 +41,15 @@ class Ros1Reader:
 
     def times(self) -> dict[int, Index]:
         """Times of receipt of the messages of each topic [ns], from its index."""
-        return {
-            k: np.array([entry.time for entry in each], np.int64) for k, each in self._bag.indexes.items()
-        }
+        indexes = self._bag.indexes.items()
+        return {k: np.array([entry.time for entry in each], np.int64) for k, each in indexes}
 
     def messages(self, ids: Collection[int], most: int | None = None) -> dict[int, Messages]:
         """The messages of some topics in the order of receipt; of about the first `most` bytes."""
-        parts = {number: (array("q"), array("q"), bytearray()) for number in ids}
-        chosen, held = [each for each in self._bag.connections if each.id in parts], 0
-        for connection, received, data in self._bag.messages(chosen) if chosen else ():
-            held += len(data)
-            check_decoded(self._path, self._size, held)
-            if most is not None and held > most:
-                break
-            times, sizes, contents = parts[connection.id]
-            times.append(received)
-            sizes.append(len(data))
-            contents += data
-        return {number: Messages.of(*several, packed=True) for number, several in parts.items()}
+        chosen = [each for each in self._bag.connections if each.id in ids]
+        found = self._bag.messages(chosen) if chosen else ()
+        rows = ((connection.id, received, data) for connection, received, data in found)
+        return gathered(self._path, rows, ids, most, packed=True)
 
 
 def _name(decompressor: Any) -> str:

@@ -46,15 +46,13 @@ class Sender:
     imu_frame: str = "imu_link"
     magnetometer_frame: str = "magnetometer_link"
     lidar_frame: str = "rplidar_link"
+    # Joints of all driven wheels, with their names in the description
     wheel_joints: tuple[WheelJoint, ...] = (
         WheelJoint("left_wheel_joint", 0),
         WheelJoint("right_wheel_joint", 1),
     )
-    """Joints of all driven wheels, with their names in the description."""
-
+    # Transforms of the drive on /tf. With "all", map to odom puts base_link at its true pose.
     transforms: Transforms = "all"
-    """Transforms of the drive on /tf. With "all", map to odom puts base_link at its true pose."""
-
     unit: Unit = "T"  # Unit of magnetic fields in messages
     odometry_std: tuple[float, ...] = (0.0,) * 6  # Of odometry's velocities, [m/s] and [rad/s]
     orientation_std: float = 0.0  # Standard deviation of each small angle of the IMU's orientation [rad]

@@ -1,6 +1,7 @@
 """Storage: topics and messages as a storage file of a rosbag2 holds them, and its metadata.yaml."""
 
-from collections.abc import Mapping, Sequence
+from array import array
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +11,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from magtwin.io.bags.cdr import Bytes, Index
+from magtwin.files.budget import check_decoded
+from magtwin.io.bags.cdr import Bytes, Index, Messages
 from magtwin.io.bags.topics import Qos
 
 VERSION = 8  # Version of metadata.yaml: the newest one that ROS 2 Humble reads
@@ -111,6 +113,27 @@ def to_yaml(content: Any) -> str:
     """YAML text of plain data."""
     dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
     return yaml.dump(content, Dumper=dumper, sort_keys=False, allow_unicode=True, width=2**30)
+
+
+def gathered(
+    path: Path, rows: Iterable[tuple[int, int, bytes]], ids: Collection[int], most: int | None, **rest: Any
+) -> dict[int, Messages]:
+    """The messages of some topics of a file, from rows of topic, time of receipt [ns] and content.
+
+    They are about the first `most` bytes; too many for the size of the file are refused.
+    """
+    found = {number: (array("q"), array("q"), bytearray()) for number in ids}
+    size, held = path.stat().st_size, 0
+    for number, received, data in rows:
+        held += len(data)  # rows of a damaged file can share their pages
+        if most is not None and held > most:
+            break
+        check_decoded(path, size, held)
+        times, sizes, contents = found[number]
+        times.append(received)
+        sizes.append(len(data))
+        contents += data
+    return {number: Messages.of(*parts, **rest) for number, parts in found.items()}
 
 
 def in_time(batches: Sequence[Batch]) -> tuple[Index, NDArray[np.intp]]:

@@ -125,10 +125,8 @@ class Stream:
         if len(t) and t[0] <= self._t:
             raise InputError(f"time runs backwards: rows at {t[0]:.9g} s come after rows at {self._t:.9g} s")
         if len(t) and not t[-1] + self.later_s < LATEST_S:
-            raise InputError(
-                f"t runs from {t[0]:.9g} to {t[-1]:.9g} s, but stamps of ROS hold 0 to {LATEST_S:.0f} s: "
-                "subtract the first time from t"
-            )
+            held = f"stamps of ROS hold 0 to {LATEST_S:.0f} s: subtract the first time from t"
+            raise InputError(f"t runs from {t[0]:.9g} to {t[-1]:.9g} s, but {held}")
         # Rows of the same nanosecond are stamped 1 ns apart; their t is in /magtwin/reading.
         count = np.arange(len(t))
         stamps = np.rint((t + self.later_s) * NS).astype(np.int64) - count
@@ -183,9 +181,8 @@ class Stream:
                 entry["first"] = first
                 first += shape[0] if shape else 1
             columns.append(entry)
-        table = {"unit": self._sender.unit, "columns": columns} | (
-            {"facts": dict(metadata)} if metadata else {}
-        )
+        table: dict[str, Any] = {"unit": self._sender.unit, "columns": columns}
+        table |= {"facts": dict(metadata)} if metadata else {}
         return json.dumps(table, ensure_ascii=False, indent=1)
 
 
@@ -195,10 +192,8 @@ def _later_s(run: Run) -> float:
     if not -np.inf < begin < 0:
         return 0.0
     later = float(-np.floor(begin))
-    text = (
-        f"t begins at {begin:.9g} s, and stamps of ROS at 0: they are t + {later:g} s; magtwin reads t back"
-    )
-    warnings.warn(text, RepairWarning, stacklevel=4)
+    text = f"stamps of ROS at 0: they are t + {later:g} s; magtwin reads t back"
+    warnings.warn(f"t begins at {begin:.9g} s, and {text}", RepairWarning, stacklevel=4)
     return later
 
 
@@ -213,9 +208,7 @@ def _alike(run: Columns, flags: Iterable[str], rows: NDArray[np.intp]) -> list[N
 
 def _finite(run: Columns, names: Iterable[str]) -> NDArray[np.bool_]:
     """Rows in which some columns are finite."""
-    return np.asarray(
-        np.logical_and.reduce([np.isfinite(run[n]).reshape(len(run[n]), -1).all(1) for n in names])
-    )
+    return np.all([np.isfinite(run[n]).reshape(len(run[n]), -1).all(axis=1) for n in names], axis=0)
 
 
 def _differ(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:

@@ -56,26 +56,20 @@ class Topic:
     qos: Qos = field(default_factory=Qos)
     needs: tuple[str, ...] = ()  # Columns without which it is not written
     carried: bool = False  # Whether a bag's reader takes the columns of `needs` from this topic
-
+    # When messages are sent: when a needed column changes and again every `every_s` while it stays; at each
+    # reading that has a value; in even steps of `every_s`; or once
     sent: Literal["changed", "each", "ticks", "once"] = "changed"
-    """When messages are sent: when a needed column changes and again every `every_s` while it stays; at each
-    reading that has a value; in even steps of `every_s`; or once."""
-
     every_s: float = 0.1  # Time after which an unchanged value is sent again, or the length of a step [s]
     lost: str = ""  # Column of flags that suspend sending again
     frame: str = ""  # Attribute of the sender with the frame of the header. Default: no header.
-
+    # Columns of flags that select the text of a message; messages are written for equal flags at a time
     by: tuple[str, ...] = ()
-    """Columns of flags that select the text of a message; messages are written for equal flags at a time."""
-
+    # Fields of messages beyond the header and the columns of `reads`; also called with the stamps [ns]
     more: Callable[[Columns, NDArray[np.int64], Sender], Fields] = lambda c, stamp, sender: {}
-    """Fields of messages beyond the header and the columns of `reads`; also called with the stamps [ns]."""
-
+    # By message type: the leaf of each column that is read, a leaf and an index, or several leaves
     reads: Mapping[str, Mapping[str, str | tuple[str, int] | tuple[str, ...]]] = field(default_factory=dict)
-    """By message type: the leaf of each column that is read, a leaf and an index, or several leaves."""
-
+    # By message type: the columns in the axes of REP 103, of columns in others
     turned: Mapping[str, Callable[[dict[str, Array]], dict[str, Array]]] = field(default_factory=dict)
-    """By message type: the columns in the axes of REP 103, of columns in others."""
 
     def write(self, c: Columns, stamp: NDArray[np.int64], sender: Sender) -> Fields:
         """Fields of messages, from the columns of some rows and their stamps [ns]."""
@@ -282,10 +276,6 @@ def _of_frd(columns: dict[str, Array]) -> dict[str, Array]:
     return {name: values * (1.0, -1.0, -1.0) for name, values in columns.items()}
 
 
-def _of_px4_imu(columns: dict[str, Array]) -> dict[str, Array]:
-    return _of_frd(columns) | {"imu_q_xyzw": np.zeros((len(columns["imu_w"]), 4))}
-
-
 def _of_ned(columns: dict[str, Array], name: str = "odom") -> dict[str, Array]:
     """Odometry of PX4, from north-east-down and forward-right-down to ENU and forward-left-up.
 
@@ -303,9 +293,8 @@ def _of_array(columns: dict[str, Array]) -> dict[str, Array]:
     """Vectors of three numbers, or magnitudes, of messages that hold any number of numbers."""
     for name, values in columns.items():
         if values.shape[1] not in (1, 3):
-            raise InputError(
-                f"its {name} has {values.shape[1]} numbers; a magnitude is one, a vector x, y, z"
-            )
+            count = values.shape[1]
+            raise InputError(f"its {name} has {count} numbers; a magnitude is one, a vector x, y, z")
     return {name: values if values.shape[1] == 3 else values[:, 0] for name, values in columns.items()}
 
 
@@ -313,21 +302,19 @@ _PX4 = "px4_msgs/msg/"
 _FIELD = "sensor_msgs/msg/MagneticField"
 _ARRAYS = {f"std_msgs/msg/Float{size}MultiArray": {"magnetic_field": "data"} for size in (64, 32)}
 
-POSE = Topic(
-    name="/robot/enu/pose",
-    kind="geometry_msgs/msg/PoseStamped",
-    needs=("mocap_p", "mocap_q_xyzw"),
-    carried=True,
-    lost="flag_pose_lost",
-    frame="map_frame",
-    reads={
-        "geometry_msgs/msg/PoseStamped": _pose_at("pose."),
+POSE = _carrier(
+    "geometry_msgs/msg/PoseStamped",
+    _pose_at("pose."),
+    {
         "geometry_msgs/msg/PoseWithCovarianceStamped": _pose_at("pose.pose."),
         "geometry_msgs/msg/TransformStamped": _pose_at("transform.", "translation", "rotation"),
         "nav_msgs/msg/Odometry": _pose_at("pose.pose."),
         _PX4 + "VehicleOdometry": {"mocap_p": "position", "mocap_q_xyzw": "q"},
     },
     turned={_PX4 + "VehicleOdometry": lambda c: _of_ned(c, "mocap")},
+    name="/robot/enu/pose",
+    lost="flag_pose_lost",
+    frame="map_frame",
 )
 ODOMETRY = _carrier(
     "nav_msgs/msg/Odometry",
@@ -354,7 +341,7 @@ IMU = _carrier(
     "sensor_msgs/msg/Imu",
     {"imu_q_xyzw": "orientation", "imu_w": "angular_velocity", "imu_a": "linear_acceleration"},
     {_PX4 + "SensorCombined": {"imu_w": "gyro_rad", "imu_a": "accelerometer_m_s2"}},
-    turned={_PX4 + "SensorCombined": _of_px4_imu},
+    turned={_PX4 + "SensorCombined": lambda c: _of_frd(c) | {"imu_q_xyzw": np.zeros((len(c["imu_w"]), 4))}},
     name="/robot/imu",
     frame="imu_frame",
     more=_imu,

@@ -21,9 +21,8 @@ def store_of(distribution: str) -> Any:
     """The message types of a distribution of ROS 2, a `rosbags.typesys.Typestore`; "latest" is the newest."""
     from rosbags.typesys import Stores, get_typestore
 
-    return get_typestore(
-        Stores.LATEST if distribution == "latest" else Stores[f"ROS2_{distribution.upper()}"]
-    )
+    name = distribution.upper()
+    return get_typestore(Stores[name if name == "LATEST" else f"ROS2_{name}"])
 
 
 @cache
@@ -101,11 +100,9 @@ def layout(kind: str, counts: Mapping[str, Any] | None = None) -> tuple[Leaf, ..
     and so on of each element. `counts` are lengths of such sequences by leaf name; others must be empty.
     """
     plain = _layout(kind)
-    return (
-        tuple(_leaves(kind, "", counts, typestore().fielddefs))
-        if counts and any(leaf.kind == "none" for leaf in plain)
-        else plain
-    )
+    if not counts or all(leaf.kind != "none" for leaf in plain):
+        return plain
+    return tuple(_leaves(kind, "", counts, typestore().fielddefs))
 
 
 @cache
@@ -149,11 +146,5 @@ def _structure(kind: str, name: str, counts: Mapping[str, Any], known: Mapping[s
         return [Leaf(name, "time")]
     inner = _leaves(kind, f"{name}.", counts, known)
     same = {(leaf.kind, leaf.count) for leaf in inner}
-    if (
-        len(inner) > 1
-        and len(same) == 1
-        and inner[0].count == 1
-        and inner[0].kind not in ("text", "none", "time")
-    ):
-        return [Leaf(name, inner[0].kind, len(inner))]
-    return inner
+    kind, count = same.pop() if len(inner) > 1 and len(same) == 1 else ("none", None)
+    return [Leaf(name, kind, len(inner))] if count == 1 and kind not in ("text", "none", "time") else inner

@@ -71,7 +71,9 @@ def write_bag(
         try:
             lab = {} if twin is None else lab_fields(twin, sender.map_frame)
             stream = Stream(run, sender, scans, lab=lab)
-            bag.begin(run, stream)
+            bag.note(run)
+            for topic in stream.topics:
+                bag.add(topic.name, topic.kind, topic.qos)
             for block in blocks(run, BLOCK):
                 bag.send(stream.messages(block))
             bag.send(stream.last())
@@ -93,12 +95,6 @@ class _Bag:
             path = path / f"{path.name.removesuffix(PARTIAL)}_0.mcap"
         self._file = path
         self.store = McapWriter(path, f"magtwin {__version__}")
-
-    def begin(self, run: Run, stream: Stream) -> None:
-        """Register the metadata and the topics of a run."""
-        self.note(run)
-        for topic in stream.topics:
-            self.add(topic.name, topic.kind, topic.qos)
 
     def add(self, topic: str, kind: str, qos: Qos, digest: str = "") -> None:
         """Register a topic, before its first message."""
@@ -126,9 +122,8 @@ class _Bag:
         self.store.flush()
         if self._folder is not None:
             aside = self._folder / "metadata.yaml.new"
-            aside.write_text(
-                to_yaml({"rosbag2_bagfile_information": self._metadata(self._file.name)}), encoding="utf-8"
-            )
+            about = {"rosbag2_bagfile_information": self._metadata(self._file.name)}
+            aside.write_text(to_yaml(about), encoding="utf-8")
             aside.replace(self._folder / "metadata.yaml")
 
     def close(self) -> None:
@@ -150,15 +145,9 @@ class _Bag:
 class RawBagWriter:
     """A bag that grows by messages in CDR, of any topics; a killed process leaves all that was flushed.
 
-    Until it ends it has another name: `run.partial.mcap` for `run.mcap`, `bag.partial` for a folder `bag`.
-    `read_bag` reads it at any time.
-
-    Args:
-        path: The folder to make, or a single file that ends in .mcap.
-        force: Replace an existing bag, and the rest of an earlier recording.
-
-    Raises:
-        InputError: The path exists and `force` is not set, or cannot be written.
+    The path is that of a folder to make, or of a single file that ends in .mcap. Until the bag ends it has
+    another name: `run.partial.mcap` for `run.mcap`, `bag.partial` for a folder `bag`; `read_bag` reads it at
+    any time. `force` replaces an existing bag, and the rest of an earlier recording.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
@@ -167,9 +156,8 @@ class RawBagWriter:
         check_free(self.path, force=force)
         self.partial = partial_of(self.path)  # Path until it ends
         if self.partial.exists() and not force:
-            raise InputError(
-                f"{self.partial}: left by a recording that did not end; read and remove it, or give --force"
-            )
+            text = "left by a recording that did not end; read and remove it, or give --force"
+            raise InputError(f"{self.partial}: {text}")
         with one_line(self.path):
             self._clear()
             self.partial.parent.mkdir(parents=True, exist_ok=True)
@@ -194,11 +182,8 @@ class RawBagWriter:
     @property
     def counts(self) -> dict[str, int]:
         """Messages so far, by topic."""
-        stored = self._bag.store.counts
-        return {
-            topic: stored[each.id] + len(self._waiting.get(topic, ()))
-            for topic, each in self._bag.connections.items()
-        }
+        stored, waiting = self._bag.store.counts, self._waiting
+        return {t: stored[c.id] + len(waiting.get(t, ())) for t, c in self._bag.connections.items()}
 
     def flush(self) -> None:
         """Make all messages outlive this process."""
@@ -231,10 +216,10 @@ class RawBagWriter:
 def check_suffix(path: Path) -> None:
     """Refuse a path that is no bag's to be written."""
     if path.suffix.lower() not in ("", ".mcap", PARTIAL):
-        raise InputError(
-            f"{path}: a bag is a folder, without a suffix, or a file that ends in .mcap; ros2 bag convert "
-            "makes a .db3 of either"
+        text = (
+            "a bag is a folder, without a suffix, or ends in .mcap; ros2 bag convert makes a .db3 of either"
         )
+        raise InputError(f"{path}: {text}")
 
 
 @contextmanager

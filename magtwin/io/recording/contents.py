@@ -20,7 +20,6 @@ from magtwin.io.recording.run import Recording
 from magtwin.io.recording.signal import STAMPS
 from magtwin.io.surveys.doctor import examine
 from magtwin.report.report import Figure, Report
-from magtwin.run.run import Run
 
 WHOLE = 400_000_000  # Bytes of the largest bag whose field is examined as a whole; else its beginning is
 BEGINNING = 100_000_000  # Bytes of the beginning of a larger bag that are examined
@@ -58,14 +57,13 @@ def info_of_bag(path: Path, **reading: Any) -> Report:
 
 def _storage(bag: Bag, times: Mapping[str, Index], size: int) -> list[Figure]:
     """Duration, begin, size and storage."""
-    first = [int(each[0]) for each in times.values() if len(each)]
-    last = [int(each[-1]) for each in times.values() if len(each)]
-    span = (max(last) - min(first)) / NS if first else 0.0
+    ends = [int(each[k]) for each in times.values() if len(each) for k in (0, -1)]
+    span = (max(ends) - min(ends)) / NS if ends else 0.0
     count = sum(map(len, times.values()))
     figures = [Figure("duration", float(f"{span:.6g}"), "s"), Figure("messages", count)]
     figures += [Figure("topics", len(bag.topics)), Figure("size", size, "bytes")]
-    if first:
-        begin = min(first)
+    if ends:
+        begin = min(ends)
         known = 0 <= begin < 253_402_300_800 * NS  # what a calendar holds
         date = f"{datetime.fromtimestamp(begin // NS, UTC):%Y-%m-%d %H:%M:%S} UTC" if known else f"{begin} ns"
         figures.append(Figure("start", date))
@@ -99,31 +97,24 @@ def _field(bag: Bag, most: int | None, reading: Mapping[str, Any]) -> tuple[Repo
     assert recording is not None
     run, said = recording.run, recording.run.metadata
     told |= {"taken": said["taken"]} if "taken" in said else {}
-    report = _examined(run, roles, f"{said['field_unit']}, {said['field_unit_told']}")
-    fit = {use: str(report.metadata[use]) for use in NEXT}
-    if texts := [*texts, *report.metadata.get("doubts", [])]:
-        told["doubts"] = texts
-    if own:
-        told["written by"] = "magtwin; magtwin report, view and reproduce take it"
-    line = next((NEXT[use] for use in NEXT if fit[use].startswith("yes")), "")
-    if line:
-        fit["next"] = line.format(bag=quote(str(bag.path)))
-    return replace(report, metadata={**told, **fit}), roles
-
-
-def _examined(run: Run, roles: Mapping[str, str], unit: str) -> Report:
-    """The field of a run, examined."""
-    names = {role.lower() for role in roles} | ({"pose"} if "p_world_base" in run else set())
-    placed = "p_world_base" in run
-    return examine(
+    unit, placed = f"{said['field_unit']}, {said['field_unit_told']}", "p_world_base" in run
+    report = examine(
         run.get("b_measured_nt"),
         vector_nt=run.get("b_vector_measured_nt"),
         t=run["t"],
         p_xy=run["p_world_base"][:, :2] if placed else None,
         yaw=run["yaw"] if placed else None,
-        roles=names,
+        roles={role.lower() for role in roles},
         unit=unit,
     )
+    fit = {use: str(report.metadata[use]) for use in NEXT}
+    if texts := [*texts, *report.metadata.get("doubts", [])]:
+        told["doubts"] = texts
+    if own:
+        told["written by"] = "magtwin; magtwin report, view and reproduce take it"
+    if line := next((NEXT[use] for use in NEXT if fit[use].startswith("yes")), ""):
+        fit["next"] = line.format(bag=quote(str(bag.path)))
+    return replace(report, metadata={**told, **fit}), roles
 
 
 def _topics(bag: Bag, times: Mapping[str, Index], roles: Mapping[str, str]) -> dict[str, str]:

@@ -61,17 +61,16 @@ class Mount(NamedTuple):
         place = ", ".join(f"{part + 0:.3g}" for part in np.round(self.p, 4))
         cosine = (np.trace(matrix_from_quat(self.q_xyzw)) - 1) / 2
         turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-        return (
-            f"{self.name!r:.40} to {self.base!r:.40}, which has it at ({place}) m, turned by {turn:.3g} deg"
-        )
+        where = f"at ({place}) m, turned by {turn:.3g} deg"
+        return f"{self.name!r:.40} to {self.base!r:.40}, which has it {where}"
 
 
 @dataclass
 class StaticFrames:
     """Transforms that do not change: those of /tf_static, and of a robot's description."""
 
+    # By frame: its parent, its origin [m] and its axes (xyzw) there
     parents: dict[str, tuple[str, Array, Array]] = field(default_factory=dict)
-    """By frame: its parent, its origin [m] and its axes (xyzw) there."""
 
     def add(self, parent: str, child: str, p: Array, q_xyzw: Array) -> None:
         """Take a transform; one that is no number or no rotation is left out."""
@@ -154,10 +153,8 @@ def mount_of(role: Role, frames: Frames, known: StaticFrames) -> tuple[Mount | N
         return None, ""
     mount = known.mount(part)
     if mount is None and kind_of(part) == "part":
-        return (
-            None,
-            f"it is the pose of {part!r:.40}, and no tree of frames has the way from base_link to there",
-        )
+        text = "and no tree of frames has the way from base_link to there"
+        return None, f"it is the pose of {part!r:.40}, {text}"
     return mount, ""
 
 
@@ -205,10 +202,9 @@ def frames_of(leaves: Iterable[Leaf], messages: Messages) -> Frames:
     each = [sorted({plain(name) for name in names.get(leaf, ())} - {""}) for leaf in LEAVES]
     for several in each:
         if len(several) > 1:
-            raise InputError(
-                f"its messages are in several frames, {', '.join(several)[:200]}; record one topic each"
-            )
-    return each[0][0] if each[0] else "", each[1][0] if each[1] else ""
+            listed = ", ".join(several)[:200]
+            raise InputError(f"its messages are in several frames, {listed}; record one topic each")
+    return "".join(each[0]), "".join(each[1])
 
 
 class Transform(NamedTuple):

@@ -46,7 +46,6 @@ def check_poses(pose_t: Array, pose: Array, where: str, topic: str) -> None:
     first = int(np.argmax(bad))
     length = float(np.linalg.norm(pose[first, 3:]))
     fault = "its quaternion is 0,0,0,0" if length == 0 else f"the length of its quaternion is {length:.3g}"
-    raise InputError(
-        f"{where}: {np.count_nonzero(bad)} of {len(pose)} poses of {topic} cannot be used, the first at "
-        f"{pose_t[first]:.3f} s: {fault}; record the orientation too, or choose another topic of poses"
-    )
+    text = f"{np.count_nonzero(bad)} of {len(pose)} poses of {topic} cannot be used"
+    advice = "record the orientation too, or choose another topic of poses"
+    raise InputError(f"{where}: {text}, the first at {pose_t[first]:.3f} s: {fault}; {advice}")

@@ -26,10 +26,8 @@ class Role:
     kinds: tuple[str, ...] = ()  # Message types of this role alone
     named: str = ""  # Words that make a topic of another readable type one of the role
     never: str = ""  # Words of topics that are not of the role
-
+    # Words by rank; topics with a word of an earlier rank go before. "*" is the rank of other topics.
     ranks: tuple[str, ...] = ()
-    """Words by rank; topics with a word of an earlier rank go before. "*" is the rank of other topics."""
-
     option: str = ""  # Option that chooses. Default: --remap.
     position: str = ""  # Column of the position of the child frame in that of the header, which is still
     orientation: str = ""  # Orientation of the child frame; without `position`, that of the header
@@ -127,9 +125,8 @@ def candidates(role: Topic, bag: "Bag", taken: Collection[str] = ()) -> list[str
     sought = ROLES[role]
     names = [name for name in bag.kinds if name not in taken and not _has(name, sought.never)]
     alone = [name for name in names if bag.kinds[name] in sought.kinds]
-    named = [
-        name for name in names if name not in alone and _has(name, sought.named) and can_be(role, bag, name)
-    ]
+    named = [name for name in names if name not in alone and _has(name, sought.named)]
+    named = [name for name in named if can_be(role, bag, name)]
     return alone + named if role is POSE else alone or named
 
 
@@ -167,16 +164,12 @@ def reads_of(role: Topic, bag: "Bag", name: str) -> Topic:
         return role
     leaves = {leaf.name: leaf for leaf in bag.layout(name) if leaf.kind in NUMBERS}
     threes = [leaf for leaf in leaves if leaves[leaf].count == 3]
-    axes = [
-        tuple(leaf[:-1] + axis for axis in "xyz")
-        for leaf in leaves
-        if leaf == "x" or leaf.endswith((".x", "_x"))
-    ]
+    begins = [leaf[:-1] for leaf in leaves if leaf == "x" or leaf.endswith((".x", "_x"))]
+    axes = [(begin + "x", begin + "y", begin + "z") for begin in begins]
     axes = [three for three in axes if leaves.keys() >= set(three)]
-    single = [leaf for leaf in leaves if leaves[leaf].count == 1]
     found = _best(threes) or (axes[0] if len(axes) == 1 else None)
     if found is None and role is MAGNITUDE:
-        found = _best(single)
+        found = _best([leaf for leaf in leaves if leaves[leaf].count == 1])
     if found is None:
         return role
     return replace(role, reads={**role.reads, kind: {"magnetic_field": found}})
@@ -200,6 +193,5 @@ def check_kind(role: Topic, bag: "Bag", name: str) -> None:
         raise bag.missing(name)
     if not can_be(role, bag, name):
         fit = " or ".join(role.reads)
-        raise InputError(
-            f"{bag.path}: topic {name} is a {bag.kinds[name] or 'message without a type'}; it must be {fit}"
-        )
+        kind = bag.kinds[name] or "message without a type"
+        raise InputError(f"{bag.path}: topic {name} is a {kind}; it must be {fit}")

@@ -55,16 +55,9 @@ def read_recording(
     unit: Unit | None = None,
     scale: float | None = None,
 ) -> "Recording":
-    """Read what a robot recorded.
+    """What a robot recorded, in a rosbag2 or a bag of ROS 1 (.bag).
 
-    Args:
-        path: Folder of a rosbag2, its storage file (.mcap, .db3), or a bag of ROS 1 (.bag).
-        topics: Topics of roles, as for `magtwin.io.bags.read_bag`.
-        unit: Unit of the field. Default: the unit that makes it the Earth's field.
-        scale: Factor from the bag's values to nT, in place of a unit.
-
-    Raises:
-        InputError: As for `magtwin.io.bags.read_bag`.
+    Arguments and errors are those of `magtwin.io.bags.read_bag`.
     """
     check_roles(topics or {})
     with Bag(Path(path)) as bag, np.errstate(over="ignore", invalid="ignore"):
@@ -143,10 +136,8 @@ class Recording:
         self._delay = int(np.median(clock.received - ns))
         clock, order = clock.in_order(ns, path)
         self._order(clock, str(order))
-        first = np.flatnonzero(
-            np.diff(order.ns, prepend=order.ns[0] - 1) > 0
-        )  # a repeated message counts once
         self._start = int(order.ns[0])
+        first = np.flatnonzero(np.diff(order.ns, prepend=self._start - 1) > 0)  # of messages of one time
         self._t: Array = (order.ns[first] - self._start) / NS
         standard = clock.kind == MAGNITUDE.kind
         values = clock.columns()["magnetic_field"]
@@ -169,12 +160,9 @@ class Recording:
         """
         told = POSE.name in self._names and not self._by_tf
         signal = self._signal(POSE) if POSE in self._topics else None
-        estimated = (
-            signal is not None and not told and ROLES[POSE].rank(signal.name) > ROLES[POSE].rank("/pose")
-        )
-        placed = None
-        if signal is None or estimated:
-            placed = self._pose_by_tf()
+        rank = ROLES[POSE].rank
+        estimated = signal is not None and not told and rank(signal.name) > rank("/pose")
+        placed = self._pose_by_tf() if signal is None or estimated else None
         if signal is not None and placed is None:
             if signal.kind in ODOMETRY.reads:
                 moved = self._corrected(signal)
@@ -186,17 +174,15 @@ class Recording:
             self._place(signal, f"topic {signal.name}")
         elif placed is not None:
             if estimated and signal is not None:
-                self.doubts.append(
-                    f"not the poses of {signal.name}, which are an estimate (--pose-topic {signal.name})"
-                )
+                text = f"which are an estimate (--pose-topic {signal.name})"
+                self.doubts.append(f"not the poses of {signal.name}, {text}")
             self.doubts.append(f"poses of {placed[1]}")
             self.roles[ROLES[POSE].noun] = TF.name
             self._place(placed[0], f"topic {placed[1]}" if placed[0].name != TF.name else placed[1])
         elif self._by_tf:
             known = ", ".join({*self.tree.moving, *self.tree.static.parents}) or "none"
-            raise InputError(
-                f"{self._bag.path}: /tf does not move a base of the robot in a map; frames: {known}"
-            )
+            text = "/tf does not move a base of the robot in a map"
+            raise InputError(f"{self._bag.path}: {text}; frames: {known}")
         elif self._survey:
             if ODOMETRY not in self._topics:
                 raise self._none_of(POSE)
@@ -254,9 +240,8 @@ class Recording:
         values["mocap_q_xyzw"] = canonical(values["mocap_q_xyzw"])
         held = self._held(values, when)
         p, q, inside = poses_at(self._t, when[first], pose)
-        p, q = (
-            np.where(inside[:, None], at, held[name]) for at, name in ((p, "mocap_p"), (q, "mocap_q_xyzw"))
-        )
+        p = np.where(inside[:, None], p, held["mocap_p"])
+        q = np.where(inside[:, None], q, held["mocap_q_xyzw"])
         self._columns |= held | {"p_world_base": p, "q_world_base_xyzw": q, "yaw": yaw_from_quat(q)}
         self._columns["flag_pose_lost"] = ~inside
         self._metadata["truth"] = truth
@@ -309,9 +294,8 @@ class Recording:
                 if topic not in told:
                     others = ", ".join(sorted(set(streams) - set(best)))
                     text = f"{ROLES[topic].noun} {best[0]}" + f" (not {others})" * bool(others)
-                    notes[
-                        "its name" if others or bag.kinds[best[0]] not in ROLES[topic].kinds else "its type"
-                    ].append(text)
+                    by_name = others or bag.kinds[best[0]] not in ROLES[topic].kinds
+                    notes["its name" if by_name else "its type"].append(text)
             elif several and (topic is MAGNITUDE or topic.name in names):
                 raise InputError(f"{bag.path}: topic {several[0]} has no message")
         for by, texts in notes.items():
@@ -339,9 +323,8 @@ class Recording:
         bag = self._bag
         kinds, listed = ", ".join(kind for kind in topic.reads if "px4" not in kind), bag.listed()
         option = f" or choose one with {ROLES[topic].option}" * bool(ROLES[topic].option)
-        return InputError(
-            f"{bag.path}: no {ROLES[topic].noun} topic ({kinds}){option}; topics in it: {listed}"
-        )
+        noun = ROLES[topic].noun
+        return InputError(f"{bag.path}: no {noun} topic ({kinds}){option}; topics in it: {listed}")
 
     def _warn(self, text: str) -> None:
         warnings.warn(f"{self._bag.path}: {text}", RepairWarning, stacklevel=6)
@@ -350,10 +333,8 @@ class Recording:
         """Warn once of the frames of sensors whose place on the robot is not known."""
         frames = ", ".join(f"{name!r:.40}" for name in self._frameless)
         topics = ", ".join(name for names in self._frameless.values() for name in names)
-        self._warn(
-            f"no /tf, /tf_static or robot_description joins {frames} to base_link: vectors of {topics} are "
-            "taken as in the axes of base_link"
-        )
+        text = f"vectors of {topics} are taken as in the axes of base_link"
+        self._warn(f"no /tf, /tf_static or robot_description joins {frames} to base_link: {text}")
 
     def _signal(self, topic: Topic) -> Signal:
         name, noun = self._topics[topic], ROLES[topic].noun
@@ -387,10 +368,9 @@ class Recording:
         signal, order = signal.in_order(ns, self._bag.path)
         when = (order.ns - self._start) / NS
         if when[-1] < 0 or when[0] > self._t[-1]:
-            raise InputError(
-                f"{self._bag.path}: {signal.name} spans {when[0]:.3f}..{when[-1]:.3f} s since the first of "
-                f"{self._metadata['clock']}, whose last is at {self._t[-1]:.3f} s; are they of one clock?"
-            )
+            span = f"{signal.name} spans {when[0]:.3f}..{when[-1]:.3f} s since the first of"
+            clock = f"{self._metadata['clock']}, whose last is at {self._t[-1]:.3f} s"
+            raise InputError(f"{self._bag.path}: {span} {clock}; are they of one clock?")
         self._order(signal, str(order))
         return signal, when
 
@@ -406,13 +386,8 @@ class Recording:
         if mount is not None:
             self.doubts.append(f"{about} from {mount}, by /tf_static")
             return in_base(role, columns, mount)
-        if (
-            not role.position
-            and frames[0]
-            and kind_of(frames[0]) != "base"
-            and not fault
-            and frames[0] not in self.tree.moving  # the base of a tree
-        ):
+        base = kind_of(frames[0]) == "base" or frames[0] in self.tree.moving
+        if frames[0] and not (role.position or fault or base):
             self._frameless.setdefault(frames[0], []).append(signal.name)
         return columns
 
@@ -430,8 +405,7 @@ class Recording:
             self._read.discard(signal.name)
             return {}
         size = np.linalg.norm(b, axis=1)
-        size = size[np.isfinite(size)]
-        if not len(size):
+        if not np.isfinite(size).any():
             return {}
         if self._told and signal.kind == self._bag.kinds[self._topics[MAGNITUDE]]:
             unit, factor = self._metadata["field_unit"], nt_per(self._unit, self._scale)

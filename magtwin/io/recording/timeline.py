@@ -55,10 +55,9 @@ def in_order(ns: Index, received: Index, where: Path, topic: str) -> Order:
     left = len(ns) - len(kept)
     if left > max(1, WRONG * len(ns)):
         k = int(np.argmax(~np.isin(everyone, kept)))
-        raise InputError(
-            f"{where}: {left} of {len(ns)} stamps of {topic} are wrong, first {ns[k] / NS:.6f} s after "
-            f"{ns[k - 1] / NS:.6f} s, in message {k + 1}; its clock is unsteady"
-        )
+        first = f"first {ns[k] / NS:.6f} s after {ns[k - 1] / NS:.6f} s, in message {k + 1}"
+        text = f"{left} of {len(ns)} stamps of {topic} are wrong, {first}"
+        raise InputError(f"{where}: {text}; its clock is unsteady")
     steps, waits = np.diff(ns[kept]), np.diff(received[kept])
     jumps = (np.abs(steps - waits) > far) & ((steps < 0) | (steps > far)) if trusted else steps < -far
     late = np.maximum.accumulate(ns[kept]) > ns[kept]
@@ -66,14 +65,13 @@ def in_order(ns: Index, received: Index, where: Path, topic: str) -> Order:
         k = int(np.argmax(jumps if jumps.any() else steps < 0))
         before, after = ns[kept[k]] / NS, ns[kept[k + 1]] / NS
         way = "run backwards" if after < before else "jump"
-        raise InputError(
-            f"{where}: stamps of {topic} {way} for good, from {before:.6f} s to {after:.6f} s, in message "
-            f"{kept[k + 1] + 1} of {len(ns)}: its clock was set; cut the recording there"
+        text = (
+            f"{way} for good, from {before:.6f} s to {after:.6f} s, in message {kept[k + 1] + 1} of {len(ns)}"
         )
+        raise InputError(f"{where}: stamps of {topic} {text}: its clock was set; cut the recording there")
     rows = kept[np.argsort(ns[kept], kind="stable")]
-    repeated = int(np.count_nonzero(np.diff(ns[rows]) == 0))
-    count = int(np.count_nonzero(late))
-    return Order(rows, ns[rows], count, int(unset.sum()), int(outlier.sum()), repeated)
+    counts = (int(np.count_nonzero(each)) for each in (late, unset, outlier, np.diff(ns[rows]) == 0))
+    return Order(rows, ns[rows], *counts)
 
 
 def _median_around(values: Index) -> NDArray[np.float64]:

@@ -24,9 +24,7 @@ MOST_DESCRIPTION = 4_000_000  # Longest description that is read [characters]
 def topics_of_frames(bag: Bag) -> list[str]:
     """The topics of a bag that tell of frames."""
     ends = {TF.name: TF.kind, TF_STATIC.name: TF.kind, "robot_description": DESCRIPTION.kind}
-    return [
-        name for name, kind in bag.kinds.items() if any(name.endswith(e) and kind == ends[e] for e in ends)
-    ]
+    return [n for n, kind in bag.kinds.items() if any(n.endswith(e) and kind == ends[e] for e in ends)]
 
 
 class Tree:
@@ -110,9 +108,8 @@ class Tree:
         for rank in ("base_link", "base_footprint", ""):
             if best := sorted(name for name in found if name.endswith(rank)):
                 if len(best) > 1 and rank:
-                    raise InputError(
-                        f"/tf has {len(best)} robots, {', '.join(best)[:200]}; record one of them"
-                    )
+                    robots = ", ".join(best)[:200]
+                    raise InputError(f"/tf has {len(best)} robots, {robots}; record one of them")
                 return best[0]
         return ""
 

@@ -74,11 +74,10 @@ def unit_of(usual: float, where: str, topic: str) -> Unit:
         for unit, factor in NT_PER.items():
             if _is_earths(usual * factor, apart):
                 return unit  # type: ignore[return-value]
-    scale = f"({USUAL_NT / usual:.4g} would make it {USUAL_NT:,.0f} nT)" if usual > 0 else ""
-    raise InputError(
-        f"{where}: the median of {topic} is {usual:.6g}; in no unit is that the Earth's field: give --unit, "
-        f"or for a normalised sensor --scale, the factor to nT {scale}"
-    )
+    advice = "give --unit, or for a normalised sensor --scale, the factor to nT"
+    advice += f" ({USUAL_NT / usual:.4g} would make it {USUAL_NT:,.0f} nT)" if usual > 0 else ""
+    text = f"the median of {topic} is {usual:.6g}; in no unit is that the Earth's field"
+    raise InputError(f"{where}: {text}: {advice}")
 
 
 def _is_earths(usual_nt: float, apart: float = 1.0) -> bool:

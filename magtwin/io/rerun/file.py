@@ -4,6 +4,7 @@ import os
 import tempfile
 import warnings
 from collections.abc import Mapping
+from itertools import cycle
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -13,18 +14,18 @@ from rerun.chunk import RrdReader
 from magtwin.errors import InputError
 from magtwin.files.file import existing
 from magtwin.files.outputs import output
-from magtwin.io.rerun.layout import RUN_COLOURS, Shown, comparison_layout, plotted
+from magtwin.io.rerun.layout import RUN_COLOURS, Shown, comparison_layout, plotted, raised
 from magtwin.io.rerun.recording import (
     ROOM,
-    Recording,
     content_id,
     flush,
     recording_of,
+    send_whole,
     size_of,
     stream,
     title_of,
 )
-from magtwin.io.rerun.series import COLUMNS_ENTITY, STATES, entity_of, table_of
+from magtwin.io.rerun.series import COLUMNS_ENTITY, entity_of, table_of
 from magtwin.io.rerun.viewer import check_decodes, show
 from magtwin.io.rerun.world import Interior, Robot, heading_of, send_room
 from magtwin.path import Path
@@ -46,37 +47,26 @@ def write_rrd(
     scans: Scans | None = None,
     force: bool = False,
 ) -> None:
-    """Write a run as a Rerun recording with a layout.
+    """Write a run as a Rerun recording (.rrd) with a layout; one without rows is refused.
 
     Every column is stored exactly and at full rate on the timeline `sim_time`; poses are drawn at 50 Hz at
     most. The recording's id comes from the run's content, so two files of one run hold the same recording.
     Only Rerun's own ids of chunks, rows and views differ, which `rerun rrd compare --unordered` ignores.
 
-    Args:
-        run: The run.
-        path: The .rrd file to make.
-        twin: Where the run took place: its stage and its map are shown. None: only series.
-        planned: The planned path, or None.
-        scans: LiDAR scans, drawn as points in world, or None.
-        force: Whether to replace an existing file.
-
-    Raises:
-        InputError: The file exists and `force` was not given or it cannot be written, the stage cannot be
-            read, or the run has no rows.
+    The `twin` is where the run took place: its stage and its map are shown, with the `planned` path and the
+    LiDAR's `scans` as points in world. Without it there are only series. `force` replaces an existing file.
     """
     _check_rows(run, path)
     name, size = title_of(run) or FilePath(path).stem, size_of(run, scans)
     shown: dict[str, Any] = {"planned": planned, "scans": scans}
     if run.rows > mapped.LONG:  # the layout looks at some rows, and at the last one
         some = np.append(np.arange(0, run.rows - 1, -(-run.rows // mapped.BLOCK)), run.rows - 1)
-        events = [key for key in STATES if key in run and run[key].any()]
-        shown |= {"known": run.take(some), "events": events}
+        shown |= {"known": run.take(some), "events": raised(run)}
         mapped.release()
+    shown |= {"room": size, "final": FilePath(path)}
     with (
         output(path, force=force) as aside,
-        recording_of(
-            run, content_id(run), name, twin, **shown, room=size, file=aside, final=FilePath(path)
-        ) as recording,
+        recording_of(run, content_id(run), name, twin, file=aside, **shown) as recording,
     ):
         for block in blocks(run):
             recording.append(block)
@@ -101,10 +91,8 @@ def write_comparison(
     entities = {entity_of("", name) for name in runs}
     if len(entities) < len(runs) or "" in entities:
         raise InputError(f"{path}: runs that are compared need names that differ, got {', '.join(runs)}")
-    compared = [
-        Shown.of(run, name=name, colour=RUN_COLOURS[k % len(RUN_COLOURS)])
-        for k, (name, run) in enumerate(runs.items())
-    ]
+    colours = cycle(RUN_COLOURS)
+    compared = [Shown.of(run, name=name, colour=next(colours)) for name, run in runs.items()]
     first = next(iter(runs.values()))
     lab, heading = (None, 0.0) if twin is None else (twin.scene.lab, heading_of(twin.field, first))
     size = ROOM + sum(map(size_of, runs.values()))
@@ -121,9 +109,7 @@ def write_comparison(
             send_room(rec, interior, twin.field, first, planned)
         for shown in compared:
             robot = None if twin is None else Robot(rec, interior, colour=shown.colour, name=shown.name)
-            recording = Recording(rec, shown.name, robot=robot)
-            recording.append(runs[shown.name])
-            recording.close()
+            send_whole(rec, runs[shown.name], shown.name, robot)
 
 
 def show_run(run: Run, twin: Twin | None = None, *, file: str | os.PathLike[str]) -> None:
@@ -144,10 +130,8 @@ def read_run(path: str | os.PathLike[str]) -> Run:
     """The run of a recording, equal to the written one to the bit; refused if it holds none, or several."""
     runs = read_runs(path)
     if len(runs) > 1:
-        raise InputError(
-            f"{path}: compares {len(runs)} runs ({', '.join(runs)}); read the file of one of them, or use "
-            "magtwin.io.rerun.file.read_runs"
-        )
+        advice = "read the file of one of them, or use magtwin.io.rerun.file.read_runs"
+        raise InputError(f"{path}: compares {len(runs)} runs ({', '.join(runs)}); {advice}")
     return next(iter(runs.values()))
 
 
@@ -163,13 +147,11 @@ def read_runs(path: str | os.PathLike[str]) -> dict[str, Run]:
                 chunks.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
         except (RuntimeError, ValueError, OSError) as error:
             reason = str(error).splitlines()[0].removeprefix(f"Failed to read RRD file at {path}: ")
-            raise InputError(
-                f"{path}: not a Rerun recording that can be read ({reason}); write it again"
-            ) from error
+            text = f"not a Rerun recording that can be read ({reason}); write it again"
+            raise InputError(f"{path}: {text}") from error
     if not chunks:
-        raise InputError(
-            f"{path}: a Rerun recording without a run of magtwin's: the entity /{COLUMNS_ENTITY} is missing"
-        )
+        text = f"a Rerun recording without a run of magtwin's: the entity /{COLUMNS_ENTITY} is missing"
+        raise InputError(f"{path}: {text}")
     runs = {}
     for batches in chunks.values():
         name, run, rows = table_of(batches, str(path))

@@ -23,7 +23,6 @@ from magtwin.io.rerun.series import (
 )
 from magtwin.run.arrow import without_pandas
 from magtwin.run.run import COLUMNS, Run
-from magtwin.spec.base import Vec3
 from magtwin.spec.lab import LabSpec
 
 Array = NDArray[np.float64]
@@ -137,6 +136,11 @@ class Shown:
         return column if np.isfinite(column).any() else None
 
 
+def raised(run: Run) -> list[str]:
+    """The flags with states that a run raised."""
+    return [key for key in STATES if key in run and run[key].any()]
+
+
 def plotted(run: Run) -> bool:
     """Whether a run has a column that is plotted."""
     shown = Shown.of(run)
@@ -162,16 +166,13 @@ def layout(
     tabs = [rrb.Vertical(*views, name=tab) for tab, views in stacks.items() if views]
     shares = [1.8, 1.1, 1.5][: len(series)] + [3.0] * bool(tabs)
     side = rrb.Vertical(*series, *([rrb.Tabs(*tabs)] if tabs else []), row_shares=shares)
-    if events is None:
-        events = [key for key in STATES if key in run and run[key].any()]
-    lanes = [STATES[key].name for key in STATES if key == "lidar_on" or key in events]
-    states = rrb.StateTimelineView(
-        origin="states", contents=[f"$origin/{name}" for name in lanes], name="States", time_view=axis
-    )
+    events = raised(run) if events is None else events
+    lanes = [f"$origin/{STATES[key].name}" for key in STATES if key == "lidar_on" or key in events]
+    states = rrb.StateTimelineView(origin="states", contents=lanes, name="States", time_view=axis)
     pages = rrb.Tabs(_event_view(), rrb.TextDocumentView(origin="metadata", name="Run"))
     about = rrb.Vertical(states, pages, row_shares=[1.2, 1.4])
-    eye: dict[str, Any] = {"position": (-0.62, 0.42, 0.55), "target": (0.08, 0.0, 0.17)}
     # from behind its left shoulder, in the robot's axes, so that it stays in view
+    eye: dict[str, Any] = {"position": (-0.62, 0.42, 0.55), "target": (0.08, 0.0, 0.17)}
     robot = _view_3d("world/robot", "Robot", [""], without="world/scale", **eye)
     below = [robot, _floor_view(lab, [""])] if lab else []
     return _blueprint(lab, heading, [""], side, [*below, about], [0.9, 1.1, 1.6])
@@ -186,20 +187,16 @@ def comparison_layout(
         for title, column, part in _COMPARED
     }
     side = rrb.Vertical(*_stacked(time_axis([shown.run for shown in runs]), plots))
-    metadata = [
-        rrb.TextDocumentView(origin=entity_of("metadata", shown.name), name=shown.name) for shown in runs
-    ]
-    about = rrb.Tabs(_event_view(), *metadata)
     names = [shown.name for shown in runs]
+    metadata = [rrb.TextDocumentView(origin=entity_of("metadata", name), name=name) for name in names]
+    about = rrb.Tabs(_event_view(), *metadata)
     below = [_floor_view(lab, names)] if lab else []
     return _blueprint(lab, heading, names, side, [*below, about], [1.0, 1.0])
 
 
 def drive_layout(lab: LabSpec) -> rrb.Blueprint:
     """The view of a lab in which a robot is driven by hand."""
-    position, target = lab_eye(lab)
-    eye: dict[str, Any] = {"without": "world/robot/sensors", "position": position, "target": target}
-    return rrb.Blueprint(_view_3d("world", "Lab, driven by hand", [""], **eye), collapse_panels=True)
+    return rrb.Blueprint(_lab_view(lab, "Lab, driven by hand", [""]), collapse_panels=True)
 
 
 def _blueprint(
@@ -217,9 +214,7 @@ def _blueprint(
         lower = rrb.Horizontal(*below, column_shares=shares)
         text = "readings along the path" if names == [""] else "a robot and its path for each run"
         title = f"Lab: map of the total field at heading {np.degrees(heading):.4g}°, {text}"
-        position, target = lab_eye(lab)
-        eye: dict[str, Any] = {"without": "world/robot/sensors", "position": position, "target": target}
-        left = rrb.Vertical(_view_3d("world", title, names, **eye), lower, row_shares=[2.0, 1.0])
+        left = rrb.Vertical(_lab_view(lab, title, names), lower, row_shares=[2.0, 1.0])
         root = rrb.Horizontal(left, side, column_shares=[3.0, 2.0])
     return bare(root)
 
@@ -258,7 +253,7 @@ def _plot(
 ) -> rrb.TimeSeriesView:
     """Lines of one unit."""
     share = _SPIKES if any(series.column in ERRORS for _, series, _ in lines) else 0.0
-    ends = value_range(np.array([np.nanquantile(values, (share, 1 - share)) for _, _, values in lines]))
+    ends = np.array([np.nanquantile(values, (share, 1 - share)) for _, _, values in lines])
     overrides: dict[Any, list[rrb.Visualizer]] = {}
     for shown, series, _ in lines:
         entity = entity_of(DERIVED_ENTITY if series.column in DERIVED else COLUMNS_ENTITY, shown.name)
@@ -270,26 +265,29 @@ def _plot(
         )
         style = rr.SeriesLines(names=[series.name], colors=[series.colour], widths=[series.width])
         overrides.setdefault(f"/{entity}", []).append(style.visualizer(mappings=[source]))
-    return rrb.TimeSeriesView(
-        origin="/",
-        contents=list(overrides),
-        name=_titled(title, [(series.name, series.colour) for _, series, _ in lines]),
-        axis_x=whole,
-        axis_y=rrb.ScalarAxis(range=ends) if ends else None,
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=not _named(lines)),
-        overrides=overrides,
+    each = [series for _, series, _ in lines]
+    names = dict.fromkeys(f"{line.name} ({_NAMES[line.colour]})" for line in each if line.colour in _NAMES)
+    named = all(series.colour in _NAMES and not shown.name for shown, series, _ in lines)  # by the title
+    title = f"{title}: {', '.join(names)}" if len(names) > 1 else title
+    return plot_view(
+        title, [*overrides], ends, whole, legend=len(lines) > 1 and not named, overrides=overrides
     )
 
 
-def _named(lines: Sequence[tuple[Shown, Series, Array]]) -> bool:
-    """Whether the title names the lines: those of one run, or a single one."""
-    return len(lines) < 2 or all(series.colour in _NAMES and not shown.name for shown, series, _ in lines)
-
-
-def _titled(title: str, lines: Sequence[tuple[str, Colour]]) -> str:
-    """A title with the lines by their colours, if there are several."""
-    names = dict.fromkeys(f"{name} ({_NAMES[colour]})" for name, colour in lines if colour in _NAMES)
-    return f"{title}: {', '.join(names)}" if len(names) > 1 else title
+def plot_view(
+    title: str, contents: list[str], values: Array, whole: rrb.TimeAxis, *, legend: bool, **rest: Any
+) -> rrb.TimeSeriesView:
+    """A plot of entities against time, whose axis covers some values."""
+    ends = value_range(values)
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=contents,
+        name=title,
+        axis_x=whole,
+        axis_y=rrb.ScalarAxis(range=ends) if ends else None,
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=legend),
+        **rest,
+    )
 
 
 def value_range(values: Array) -> tuple[float, float] | None:
@@ -306,12 +304,13 @@ def value_range(values: Array) -> tuple[float, float] | None:
     )
 
 
-def lab_eye(lab: LabSpec) -> tuple[Vec3, Vec3]:
-    """Position and target of an eye above the near edge of the floor that sees a whole lab, in world [m]."""
+def _lab_view(lab: LabSpec, title: str, names: Sequence[str]) -> rrb.Spatial3DView:
+    """A whole lab, from above the near edge of its floor."""
     x0, x1, y0, y1 = lab.extent_m
     x, y, at_x, at_y = x1 - x0, y1 - y0, (x0 + x1) / 2, (y0 + y1) / 2
     height = max(0.9 * max(x, 1.7 * y), 1.5 * lab.post_height_m)
-    return (at_x, at_y - 0.45 * y, height), (at_x, at_y - 0.09 * y, 0)
+    position, target = (at_x, at_y - 0.45 * y, height), (at_x, at_y - 0.09 * y, 0.0)
+    return _view_3d("world", title, names, without="world/robot/sensors", position=position, target=target)
 
 
 def _floor_view(lab: LabSpec, names: Sequence[str]) -> rrb.Spatial2DView:

@@ -3,7 +3,6 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -13,10 +12,10 @@ from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.files.outputs import output
 from magtwin.frames import wrap_angle
-from magtwin.io.rerun.layout import UP_TO_NOW, bare, time_axis, value_range
-from magtwin.io.rerun.recording import ROOM, Recording, content_id, size_of, stream, title_of
-from magtwin.io.rerun.series import TIMELINE, Array, nanoseconds, send
-from magtwin.io.rerun.world import Scale, heading_of, send_map
+from magtwin.io.rerun.layout import UP_TO_NOW, bare, plot_view, time_axis
+from magtwin.io.rerun.recording import ROOM, content_id, send_whole, size_of, stream, title_of
+from magtwin.io.rerun.series import Array, send, send_clouds
+from magtwin.io.rerun.world import UPWARDS, Scale, heading_of, send_map
 from magtwin.run.arrow import without_pandas
 from magtwin.run.run import Run
 
@@ -25,11 +24,8 @@ FLOOR, PATHS = "floor", "floor/paths"
 MOST_PARTICLES = 300  # Particles drawn at a time, each of the same weight
 ARROW_M = 0.25  # Length of the arrows that show the headings [m]
 
-TRUTH, ESTIMATE, DEAD, BOUND, BAND = (
-    *((235, 235, 235), (255, 130, 50), (86, 156, 255), (92, 200, 120)),
-    (255, 205, 150),
-)
-PARTICLES = (230, 60, 110)
+TRUTH, ESTIMATE, DEAD = (235, 235, 235), (255, 130, 50), (86, 156, 255)
+BOUND, BAND, PARTICLES = (92, 200, 120), (255, 205, 150), (230, 60, 110)
 
 
 @without_pandas()
@@ -54,24 +50,21 @@ def write_localization(
     if not run.rows or "est_p_world_base" not in run:
         raise InputError(f"{path}: the run has no estimates to record; run `magtwin localize` on it first")
     series = _series(run, truth, dead_reckoning, bound_m)
+    views = _layout(run, series, anomaly_map, truth)
     name = ", ".join([*([title] if (title := title_of(run)) else []), str(run.metadata.get("localizer", ""))])
+    name = name or Path(path).stem
     room = 2 * ROOM + 2 * size_of(run) + run.rows * (2400 + 16 * MOST_PARTICLES)
     room += 0 if anomaly_map is None else 8 * 1024**2
     with (
         output(path, force=force) as aside,
-        stream(
-            content_id(run),
-            name or Path(path).stem,
-            _layout(run, series, anomaly_map, truth),
-            file=aside,
-            final=Path(path),
-            room=room,
-        ) as rec,
+        stream(content_id(run), name, views, file=aside, final=Path(path), room=room) as rec,
     ):
-        recording = Recording(rec)
-        recording.append(run)
-        recording.close()
-        _send_floor(rec, run, anomaly_map)
+        send_whole(rec, run)
+        if anomaly_map is None:
+            rec.log(PATHS, UPWARDS, static=True)
+        else:
+            scale = Scale.over(anomaly_map, np.empty(0))
+            send_map(rec, anomaly_map, scale, heading_of(anomaly_map, run))
         _send_path(rec, run, truth, dead_reckoning)
         _send_spread(rec, run, particles)
         for lines in series.values():
@@ -104,17 +97,15 @@ def _series(
             position["position/dead_reckoning"] = ("dead reckoning", DEAD, 1.5, away)
     if bound_m is not None:
         position["position/bound"] = ("bound, 1 sigma", BOUND, 2.0, bound_m)
-    offset: dict[str, Line] = {
-        "offset/estimate": ("offset of the magnetometer", ESTIMATE, 2.0, run["est_bias_nt"])
-    }
-    lost: dict[str, Line] = {"lost/flag": ("flagged lost", DEAD, 2.0, run["est_lost"].astype(float))}
-    plots = {"Position error [m]": position, "Heading error [deg]": heading, "Offset [nT]": offset}
-    plots |= {"Flagged lost [0, 1]": lost} if run["est_lost"].any() else {}
-    known = {
-        title: {entity: line for entity, line in lines.items() if np.isfinite(line[3]).any()}
-        for title, lines in plots.items()
-    }
-    return {title: lines for title, lines in known.items() if lines}
+    offset = ("offset of the magnetometer", ESTIMATE, 2.0, run["est_bias_nt"])
+    plots = {"Position error [m]": position, "Heading error [deg]": heading}
+    plots["Offset [nT]"] = {"offset/estimate": offset}
+    if run["est_lost"].any():
+        lost = ("flagged lost", DEAD, 2.0, run["est_lost"].astype(float))
+        plots["Flagged lost [0, 1]"] = {"lost/flag": lost}
+    for title, lines in plots.items():
+        plots[title] = {entity: line for entity, line in lines.items() if np.isfinite(line[3]).any()}
+    return {title: lines for title, lines in plots.items() if lines}
 
 
 def _layout(
@@ -123,18 +114,8 @@ def _layout(
     axis = time_axis([run])
     views = []
     for title, lines in series.items():
-        values = np.concatenate([line[3] for line in lines.values()])
-        ends = value_range(values)
-        views.append(
-            rrb.TimeSeriesView(
-                origin="/",
-                contents=[f"/{entity}" for entity in lines],
-                name=title,
-                axis_x=axis,
-                axis_y=rrb.ScalarAxis(range=ends) if ends else None,
-                plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=len(lines) > 1),
-            )
-        )
+        values, shown = np.concatenate([line[3] for line in lines.values()]), [f"/{e}" for e in lines]
+        views.append(plot_view(title, shown, values, axis, legend=len(lines) > 1))
     if field is not None:
         x0, x1, y0, y1 = field.extent
     else:
@@ -154,15 +135,6 @@ def _layout(
     return bare(rrb.Horizontal(left, rrb.Vertical(*views, row_shares=shares), column_shares=[3.0, 2.0]))
 
 
-def _send_floor(rec: rr.RecordingStream, run: Run, field: AnomalyMap | None) -> None:
-    if field is not None:
-        heading = heading_of(field, run)
-        send_map(rec, field, Scale.over(field, np.empty(0)), heading)
-    else:
-        upwards = rr.Transform3D(mat3x3=[[1, 0, 0], [0, -1, 0], [0, 0, 1]])  # pictures have y downwards
-        rec.log(PATHS, upwards, static=True)
-
-
 def _send_path(rec: rr.RecordingStream, run: Run, truth: Array | None, dead_reckoning: Array | None) -> None:
     """The paths, and an arrow at the estimated and at the true pose."""
     t = run["t"]
@@ -172,18 +144,15 @@ def _send_path(rec: rr.RecordingStream, run: Run, truth: Array | None, dead_reck
             line = rr.LineStrips2D([known], radii=0.008, colors=colour, draw_order=1.0)
             rec.log(f"{PATHS}/{name}", line, static=True)
     p = run["est_p_world_base"][:, :2].astype(np.float32)
-    paint: dict[str, Any] = {"colors": [ESTIMATE]}
-    rec.log(
-        f"{PATHS}/estimate", rr.LineStrips2D.from_fields(radii=[0.012], draw_order=2.0, **paint), static=True
-    )
+    line = rr.LineStrips2D.from_fields(radii=[0.012], draw_order=2.0, colors=[ESTIMATE])
+    rec.log(f"{PATHS}/estimate", line, static=True)
     strips = np.stack([p[np.maximum(np.arange(len(p)) - 1, 0)], p], axis=1)
     send(rec, f"{PATHS}/estimate", t, rr.LineStrips2D, strips=strips)
-    poses = {"estimated": np.column_stack([p, run["est_yaw"]])}
-    if truth is not None:
-        poses["true"] = truth
-    for name, pose in poses.items():
-        colour = TRUTH if name == "true" else ESTIMATE
-        look = rr.Arrows2D.from_fields(radii=[0.03], colors=[colour], draw_order=4.0 + (name == "estimated"))
+    estimated = np.column_stack([p, run["est_yaw"]])
+    for name, pose, colour, order in (("estimated", estimated, ESTIMATE, 5.0), ("true", truth, TRUTH, 4.0)):
+        if pose is None:
+            continue
+        look = rr.Arrows2D.from_fields(radii=[0.03], colors=[colour], draw_order=order)
         rec.log(f"{PATHS}/robot/{name}", look, static=True)
         ahead = ARROW_M * np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
         arrow = {"origins": pose[:, :2].astype(np.float32), "vectors": ahead.astype(np.float32)}
@@ -197,10 +166,7 @@ def _send_spread(rec: rr.RecordingStream, run: Run, particles: Sequence[Array]) 
         entity = f"{PATHS}/particles"
         look = rr.Points2D.from_fields(radii=[0.009], colors=[PARTICLES], draw_order=1.5)
         rec.log(entity, look, static=True)
-        drawn = [_decimated(cloud) for cloud in particles]
-        columns = rr.Points2D.columns(positions=np.concatenate(drawn).astype(np.float32))
-        times = rr.TimeColumn(TIMELINE, duration=nanoseconds(t))
-        rec.send_columns(entity, [times], columns.partition([len(part) for part in drawn]))
+        send_clouds(rec, entity, t, [_decimated(cloud) for cloud in particles], rr.Points2D)
     known = np.isfinite(covariance).all(axis=1)
     if known.any():
         line = rr.LineStrips2D.from_fields(radii=[0.008], colors=[BAND], draw_order=3.0)

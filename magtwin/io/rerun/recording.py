@@ -58,20 +58,17 @@ def check_room(file: FilePath, size: int, final: FilePath | None = None) -> None
             elif shutil.disk_usage(file.parent).free < size:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     except OSError as error:
-        raise InputError(
-            f"{final or file}: cannot be written ({error.strerror}): up to {size / 1e6:.1f} MB are needed; "
-            "make room"
-        ) from error
+        text = f"cannot be written ({error.strerror}): up to {size / 1e6:.1f} MB are needed; make room"
+        raise InputError(f"{final or file}: {text}") from error
 
 
 def size_of(run: Run, scans: Scans | None = None) -> int:
     """Upper bound of the bytes of a run's rows in a recording, and of the scans in the same time."""
-    columns = sum(values.nbytes + 4 * run.rows for values in run.values())
-    seen = 0
+    size = sum(values.nbytes + 4 * run.rows for values in run.values()) + 136 * run.rows
     if scans is not None and run.rows:
         first, last = np.searchsorted(scans.t, run["t"][[0, -1]])
-        seen = (int(last - first) + 2) * (16 * scans.ranges_m.shape[1] + 64)
-    return columns + 24 * run.rows + 2 * (24 + 4 * 8) * run.rows + seen
+        size += (int(last - first) + 2) * (16 * scans.ranges_m.shape[1] + 64)
+    return size
 
 
 @contextmanager
@@ -100,9 +97,8 @@ def stream(
         await_rerun(rerun_bindings.flush_and_cleanup_orphaned_recordings, folder)
     # What is written together must not depend on the speed of the machine; a viewer gets it as it comes.
     batches = None if file is None else rr.ChunkBatcherConfig(flush_tick=NEVER)
-    rec = rr.RecordingStream(
-        APPLICATION, recording_id=recording_id, send_properties=False, batcher_config=batches
-    )
+    options: Any = {"send_properties": False, "batcher_config": batches}
+    rec = rr.RecordingStream(APPLICATION, recording_id=recording_id, **options)
     if not rr.is_enabled(rec):
         raise InputError(f"{final}: Rerun is switched off by the environment variable RERUN; unset it")
     rr.set_strict_mode(True)
@@ -174,7 +170,7 @@ def await_rerun(work: Callable[[], object], folder: FilePath | None) -> None:
 def unwritten(path: FilePath | None, why: object) -> InputError:
     """The error of a file that could not be written."""
     return InputError(
-        f"{path}: cannot be written ({why}); is the disk full, or a limit on file sizes reached?"
+        f"{path}: cannot be written ({why}); is the disk full, or a limit of file sizes reached?"
     )
 
 
@@ -223,9 +219,15 @@ class Recording:
             self._feed.clear(float(self._last["t"][-1]))
         rows: dict[str, Any] = {ROWS: [self._rows]}  # marks a complete run
         self.rec.log(entity_of(COLUMNS_ENTITY, self.name), rr.AnyValues(**rows), static=True)
-        self.rec.log(
-            entity_of("metadata", self.name), metadata_page(self._last.metadata, self._rows), static=True
-        )
+        page = metadata_page(self._last.metadata, self._rows)
+        self.rec.log(entity_of("metadata", self.name), page, static=True)
+
+
+def send_whole(rec: rr.RecordingStream, run: Run, name: str = "", robot: Robot | None = None) -> None:
+    """Send all rows of a run."""
+    recording = Recording(rec, name, robot)
+    recording.append(run)
+    recording.close()
 
 
 @contextmanager
@@ -263,11 +265,11 @@ def recording_of(
         if properties:
             rec.send_property("run", rr.AnyValues(**properties))
         rec.log("metadata", metadata_page(run.metadata), static=True)
-        robot = None
+        recording = Recording(rec)
         if twin is not None:
             scale = send_room(rec, interior, twin.field, known, planned)
-            robot = Robot(rec, interior, scale, rate_hz=rate_hz)
-        yield Recording(rec, robot=robot, scans=scans)
+            recording = Recording(rec, "", Robot(rec, interior, scale, rate_hz=rate_hz), scans)
+        yield recording
 
 
 def title_of(run: Run) -> str:

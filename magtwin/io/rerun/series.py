@@ -140,6 +140,13 @@ def send(rec: rr.RecordingStream, entity: str, t: Array, archetype: Any, **value
         rec.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=times[part])], columns)
 
 
+def send_clouds(rec: rr.RecordingStream, entity: str, t: Array, clouds: list[Array], points: Any) -> None:
+    """Send sets of points (P, 2 or 3) at times t [s], one set each; `points` is the archetype."""
+    columns = points.columns(positions=np.concatenate(clouds).astype(np.float32))
+    times = rr.TimeColumn(TIMELINE, duration=nanoseconds(t))
+    rec.send_columns(entity, [times], columns.partition([len(cloud) for cloud in clouds]))
+
+
 def send_metadata(rec: rr.RecordingStream, run: Run, name: str) -> None:
     """Send the metadata of a run, and its columns in their order."""
     specs = {key: said_of(run.spec(key), key) for key in run}
@@ -211,10 +218,10 @@ def table_of(chunks: list[pa.RecordBatch], what: str) -> tuple[str, Run, int | N
             own[name] = spec_said({key: str(text) for key, text in names[name].items()}, parts)
         run = Run(columns, metadata, own)
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError, pa.ArrowException) as error:
-        raise InputError(
-            f"{what}: a Rerun recording, but not one of a run that magtwin can read "
-            f"({type(error).__name__}: {error}); read the run's Parquet, or record it again"
-        ) from error
+        text = (
+            f"a Rerun recording, but not one of a run that magtwin can read ({type(error).__name__}: {error})"
+        )
+        raise InputError(f"{what}: {text}; read the run's Parquet, or record it again") from error
     return str(static.get(NAME) or COLUMNS_ENTITY), run, rows
 
 
@@ -236,8 +243,8 @@ class Flags:
     name: str = ""
 
     _before: dict[str, bool] = field(default_factory=dict)
+    # Open events by column: time of the start and of the last raised row [s], and place of the latter
     _open: dict[str, tuple[float, float, str]] = field(default_factory=dict)
-    """Open events by column: time of the start and of the last raised row [s], and place of the latter."""
 
     def append(self, run: Run) -> None:
         """Add the next rows."""
@@ -247,8 +254,7 @@ class Flags:
                 continue
             flag = run[column]
             before = self._before.get(column)
-            first = flag[0] != before  # the first row always is a change
-            rows = np.flatnonzero(np.append(first, flag[1:] != flag[:-1]))
+            rows = np.flatnonzero(np.append(flag[0] != before, flag[1:] != flag[:-1]))  # the first one always
             if before is None and not self.name:
                 values = [state.down, state.up]
                 style = rr.StateConfiguration(values=values, colors=[(70, 70, 76), (255, 158, 64)])
@@ -256,8 +262,7 @@ class Flags:
             self._before[column] = bool(flag[-1])
             if not self.name:
                 words = np.where(flag[rows], state.up, state.down).tolist()
-                t = run["t"][rows]
-                send(self.rec, f"states/{state.name}", t, rr.StateChange, state=words)
+                send(self.rec, f"states/{state.name}", run["t"][rows], rr.StateChange, state=words)
             if column in self._open or flag.any():
                 events += self._episodes(column, run)
         self._send(events)
@@ -273,18 +278,16 @@ class Flags:
             since = float(t[first])
             if column in self._open and since - self._open[column][1] > GAP_S:
                 yield self._end(column)
-            if column in self._open:
-                since = self._open[column][0]
-            else:
+            if column not in self._open:
                 yield since, STATES[column].level, f"{STATES[column].begins}{_place(run, first)}"
+            since = self._open[column][0] if column in self._open else since
             self._open[column] = since, float(t[last]), _place(run, last)
         if column in self._open and t[-1] - self._open[column][1] > GAP_S:
             yield self._end(column)
 
     def _end(self, column: str) -> tuple[float, str, str]:
         since, until, place = self._open.pop(column)
-        text = f"{STATES[column].ends}{place}, after {until - since:.2f} s"
-        return until, "INFO", text
+        return until, "INFO", f"{STATES[column].ends}{place}, after {until - since:.2f} s"
 
     def _send(self, events: list[tuple[float, str, str]]) -> None:
         if not events:
@@ -292,8 +295,7 @@ class Flags:
         events.sort(key=lambda event: event[0])
         t, levels, texts = zip(*events, strict=True)
         named = [f"{self.name}: {text}" for text in texts] if self.name else list(texts)
-        at = np.array(t)
-        send(self.rec, "events", at, rr.TextLog, text=named, level=list(levels))
+        send(self.rec, "events", np.array(t), rr.TextLog, text=named, level=list(levels))
 
 
 def _place(run: Run, row: np.intp) -> str:

@@ -39,10 +39,8 @@ LATE_S = 5.0  # Time after which no answer is a late one: Rerun's client waits f
 FRAMES = 20  # Frames after which a loaded file shows something, and notices are gone
 
 CANNOT_DRAW = re.compile(r"render context|adapter|graphics|wgpu|surface", re.IGNORECASE)
-"""Words of a viewer that ended because it cannot draw."""
-
 VULKAN = "without a graphics card it needs Vulkan in software: apt install mesa-vulkan-drivers libvulkan1"
-"""What to do then."""
+"""Words of a viewer that ended because it cannot draw, and what to do then."""
 
 TITLE_BAR = 36  # Height of the viewer's empty title bar [pixels]
 TOASTS_S, NOTHING_S = 6.0, 10.0  # Times until the viewer's notices are gone, and a file shows something [s]
@@ -58,11 +56,9 @@ def show(rrd: str | os.PathLike[str], *, source: str | os.PathLike[str] | None =
     options: dict[str, Any] = {"capture_output": False, "stderr": subprocess.PIPE}
     result = run(command, preexec_fn=ends_with_parent(), **options)
     if result.returncode:
-        advice = "view the .rrd of this run, which a browser shows too"
-        if source is None:
-            advice = f"use a browser: rerun --web-viewer --bind {LOCALHOST} {rrd}"
-        reason = _reason(result.stderr)
-        text = f"the Rerun viewer opened no window: {reason}; without a display {advice}"
+        advice = f"use a browser: rerun --web-viewer --bind {LOCALHOST} {rrd}"
+        advice = advice if source is None else "view the .rrd of this run, which a browser shows too"
+        text = f"the Rerun viewer opened no window: {_reason(result.stderr)}; without a display {advice}"
         raise InputError(f"{source or rrd}: {text}")
 
 
@@ -101,23 +97,18 @@ def _draw(
     client.open(str(path))
     _wait_until(lambda: not client.get_state().loading, f"{source}: the viewer did not load it")
     _show_frames(client, NOTHING_S, lambda: _timelines(client) != [])
-    if not _timelines(client):
-        raise InputError(
-            f"{source}: holds nothing that the viewer shows; if the recording was cut short, write it again"
-        )
+    if not (timelines := _timelines(client)):
+        text = "holds nothing that the viewer shows; if the recording was cut short, write it again"
+        raise InputError(f"{source}: {text}")
     if time_s is not None:
-        timelines = _timelines(client)
         line = next((timeline for timeline in timelines if timeline.name == TIMELINE), None)
         if line is None or line.start is None or line.end is None:
-            raise InputError(
-                f"{source}: has no timeline {TIMELINE!r} to find a time on; it has "
-                f"{', '.join(timeline.name for timeline in timelines)}"
-            )
+            names = ", ".join(timeline.name for timeline in timelines)
+            raise InputError(f"{source}: has no timeline {TIMELINE!r} to find a time on; it has {names}")
         first, last = line.start / 1e9, line.end / 1e9
         if not first <= time_s <= last:
-            raise InputError(
-                f"{source}: the recording goes from {first:g} to {last:g} s; there is no {time_s:g} s in it"
-            )
+            span = f"the recording goes from {first:g} to {last:g} s"
+            raise InputError(f"{source}: {span}; there is no {time_s:g} s in it")
         client.set_time(TIMELINE, duration=time_s, play_state="paused")
     client.run_command("ui.toggle_top_panel")
     _show_frames(client, TOASTS_S)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import quat_multiply, rotate, wrap_angle
 from magtwin.io.rerun.layout import Colour
-from magtwin.io.rerun.series import TIMELINE, entity_of, nanoseconds, send
+from magtwin.io.rerun.series import TIMELINE, entity_of, send, send_clouds
 from magtwin.path import Path
 from magtwin.run.run import Run
 from magtwin.sim.sensors.lidar import Scans
@@ -32,6 +32,7 @@ DOT_HZ = 10.0  # Greatest rate of readings drawn along the path
 SCALE_HEIGHT_M = 1.0  # Height of the colour bar [m]: above desks and chairs, which would hide it on the floor
 ARROW_M_PER_NT = 1.4e-5  # Length of the field arrow: 70 cm for 50 uT
 DRIVEN: Colour = (230, 60, 60)  # Colour of a driven path
+UPWARDS = rr.Transform3D(mat3x3=[[1, 0, 0], [0, -1, 0], [0, 0, 1]])  # Pictures have y downwards
 
 
 @dataclass(frozen=True)
@@ -124,8 +125,7 @@ def send_map(rec: rr.RecordingStream, field: AnomalyMap, scale: Scale, heading: 
     place = rr.Transform3D(translation=(x0, -y1, 0), scale=((x1 - x0) / width, (y1 - y0) / height, 1))
     rec.log("floor/map", place, static=True)
     rec.log("floor/map", rr.Image(pixels, draw_order=-1.0), static=True)
-    upwards = rr.Transform3D(mat3x3=[[1, 0, 0], [0, -1, 0], [0, 0, 1]])  # pictures have y downwards
-    rec.log("floor/paths", upwards, static=True)
+    rec.log("floor/paths", UPWARDS, static=True)
 
 
 def _pixels(field: AnomalyMap) -> tuple[float, int, int]:
@@ -146,8 +146,7 @@ def _send_scale(rec: rr.RecordingStream, field: AnomalyMap, scale: Scale) -> Non
     _send_image(rec, "world/scale", bar, cell, corner)
     share = np.linspace(0, 1, 5)
     at = np.column_stack([corner[0] + share * length, np.full(5, corner[1] - 0.08), np.full(5, corner[2])])
-    value_ut = (scale.low_nt + share * (scale.high_nt - scale.low_nt)) / 1000
-    texts = [f"{v:g} µT" for v in value_ut]
+    texts = [f"{v:g} µT" for v in (scale.low_nt + share * (scale.high_nt - scale.low_nt)) / 1000]
     values = rr.Points3D(at, labels=texts, radii=0.0, colors=(255, 255, 255), show_labels=True)
     rec.log("world/scale/values", values, static=True)
 
@@ -194,9 +193,7 @@ class Feed:
         for start in range(self._sent, end, SCANS):
             rows = slice(start, min(end, start + SCANS))
             part = [self._points[k] for k in self._order[rows]]
-            columns = rr.Points3D.columns(positions=np.concatenate(part).astype(np.float32))
-            times = rr.TimeColumn(TIMELINE, duration=nanoseconds(self._t[rows]))
-            self._rec.send_columns(SCAN, [times], columns.partition([len(p) for p in part]))
+            send_clouds(self._rec, SCAN, self._t[rows], part, rr.Points3D)
         self._sent = max(self._sent, end)
 
     def clear(self, t: float) -> None:
@@ -225,8 +222,7 @@ class Robot:
 
     def __post_init__(self) -> None:
         rec, root = self.rec, entity_of("world/robot", self.name)
-        drive, links = self.interior.robot.drive, self.interior.links
-        sides = drive.sides
+        sides, links = self.interior.robot.drive.sides, self.interior.links
         bases = [name for name, link in links.items() if not link.joint] or [""]
         base = BASE_LINK if BASE_LINK in links else bases[0]
         for name, link in links.items():
@@ -269,7 +265,12 @@ class Robot:
             rate = self.rate_hz or ((run.rows - 1) / run.duration_s if run.duration_s else 0.0)
             self._strides = _stride(rate, POSE_HZ), _stride(rate, DOT_HZ)
             if self.scale is not None and np.isfinite(run.get("b_vector_nt", np.nan)).any():
-                self._send_vector_style()
+                # The field arrow in sensor axes, with its middle at the sensor
+                entity, robot = f"{entity_of('world/robot', self.name)}/magnetometer", self.interior.robot
+                place = _transform(robot.p_base_magnetometer, robot.q_base_magnetometer_xyzw)
+                self.rec.log(entity, place, static=True)
+                style = rr.Arrows3D.from_fields(colors=[(255, 255, 255)], radii=[0.006])
+                self.rec.log(f"{entity}/field", style, static=True)
         first, poses, dots = self._rows, *self._strides
         self._rows += run.rows
         self._pose(run, np.arange(-first % poses, run.rows, poses))
@@ -277,14 +278,9 @@ class Robot:
 
     def close(self, last: Run) -> None:
         """End the path with `last`, the last row of the run."""
-        if self._strides is None:
-            return
-        row = np.array([0])
-        poses, dots = self._strides
-        if (self._rows - 1) % poses:
-            self._pose(last, row)
-        if (self._rows - 1) % dots:
-            self._trail(last, row)
+        for stride, send_rows in zip(self._strides or (), (self._pose, self._trail), strict=False):
+            if (self._rows - 1) % stride:
+                send_rows(last, np.array([0]))
 
     def _pose(self, run: Run, rows: NDArray[np.intp]) -> None:
         """Poses of base and wheels at some rows, and the field vector at the sensor."""
@@ -309,15 +305,6 @@ class Robot:
             if len(arrows):
                 entity = f"{root}/magnetometer/field"
                 send(rec, entity, t[known], rr.Arrows3D, vectors=arrows, origins=-arrows / 2)
-
-    def _send_vector_style(self) -> None:
-        """Pose and style of the field arrow in sensor axes, with its middle at the sensor."""
-        entity = f"{entity_of('world/robot', self.name)}/magnetometer"
-        robot = self.interior.robot
-        place = _transform(robot.p_base_magnetometer, robot.q_base_magnetometer_xyzw)
-        self.rec.log(entity, place, static=True)
-        style = rr.Arrows3D.from_fields(colors=[(255, 255, 255)], radii=[0.006])
-        self.rec.log(f"{entity}/field", style, static=True)
 
     def _trail(self, run: Run, rows: NDArray[np.intp]) -> None:
         """The path on the floor, and above it a ribbon of the readings at the sensor's positions."""

@@ -58,10 +58,8 @@ def examine(
     known &= True if vector_nt is None else np.isfinite(vector_nt).all(axis=1)
     share = round(100 * float(known.mean()), 1) if len(b_nt) else 0.0
     figures = [Figure("field in", unit), Figure("finite readings", share, "%", note=f"of {len(b_nt):,}")]
-    b, (vector, clock, p, angle) = (
-        b_nt[known],
-        (None if values is None else values[known] for values in (vector_nt, t, p_xy, yaw)),
-    )
+    b, given = b_nt[known], (vector_nt, t, p_xy, yaw)
+    vector, clock, p, angle = (None if values is None else values[known] for values in given)
     doubts, sectors = list[str](), 0
     if len(b) > 2:
         low, usual, high = np.quantile(b, (0.01, 0.5, 0.99))
@@ -93,14 +91,10 @@ def info_of_survey(file: Path, told: Columns, waypoints: Path | None, step_m: fl
 
     table = table_of_log(file, waypoints, step_m)
     vector, b, t, unit = field_of_table(table, told)
-    options = {
-        name: value
-        for name, value in {"waypoints": waypoints, "step_m": step_m, **asdict(told)}.items()
-        if value
-    }
-    flags = [word for name, value in options.items() for word in (f"--{name.replace('_', '-')}", str(value))]
-    then = shlex.join([str(file), *flags])
-    roles = [role for role, symbols in (("odometry", ("v", "w")),) if table.find(*symbols)]
+    options = {"waypoints": waypoints, "step_m": step_m, **asdict(told)}
+    flags = [(f"--{name.replace('_', '-')}", str(value)) for name, value in options.items() if value]
+    then = shlex.join([str(file), *(word for flag in flags for word in flag)])
+    roles = ["odometry"] if table.find("v", "w") else []
     try:
         readings, rows = rows_of_table(table, told, file.stem, file.name)
     except InputError as error:
@@ -156,17 +150,15 @@ def _stuck(b: Array, t: Array | None) -> Figure:
 
 def _turns(vector: Array | None, yaw: Array | None) -> tuple[list[Figure], int]:
     """Coverage of headings and the hard iron, and the number of sectors of headings."""
-    figures = list[Figure]()
+    centre, sd = (np.zeros(2), 0.0) if vector is None else _circle(vector[:, :2])
     if yaw is not None and np.isfinite(yaw).any():
         sectors, by = _sectors(yaw[np.isfinite(yaw)]), ""
     elif vector is not None:
-        centre = _circle(vector[:, :2])[0]
         sectors, by = _sectors(np.arctan2(*(vector[:, 1::-1] - centre).T)), "by the level field's direction"
     else:
-        return figures, 0
-    figures.append(Figure("headings", f"{sectors} of {SECTORS}", "sectors of 30 deg", note=by))
+        return [], 0
+    figures = [Figure("headings", f"{sectors} of {SECTORS}", "sectors of 30 deg", note=by)]
     if vector is not None and sectors >= LEAST_SECTORS:
-        centre, sd = _circle(vector[:, :2])
         text = f"{centre[0]:,.0f}, {centre[1]:,.0f}"
         figures.append(Figure("hard iron", text, "nT", spread=float(f"{sd:.3g}"), note="x and y, estimated"))
     return figures, sectors

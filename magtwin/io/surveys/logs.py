@@ -7,6 +7,7 @@ of the field gets the places of the others, joined by time.
 import re
 import zipfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,17 +63,12 @@ def table_of_log(path: Path, waypoints: Path | None = None, step_m: float | None
     A log is a table; a folder or a zip of tables, as phyphox and Sensor Logger write them; a trace of an
     Android phone; or a log of a vehicle: PX4 (.ulg), ArduPilot (.bin) or HDF5.
     """
-    if is_log(path):
-        parts = _parts(path)
-        name, field = _field(path, parts)
-    else:
-        name, field = path.stem, read_table(path)
-        parts = {name: field}
+    parts = _parts(path) if (log := is_log(path)) else {path.stem: read_table(path)}
+    name, field = _field(path, parts) if log else (path.stem, parts[path.stem])
     marks = marks_of(read_table(waypoints), timed=False) if waypoints else _marks(parts, name)
     if waypoints and marks is None:
-        raise InputError(
-            f"{waypoints}: no marks; a row is t,x,y, or t and a note such as 1.5,2, or x,y in order"
-        )
+        text = "a row is t,x,y, or t and a note such as 1.5,2, or x,y in order"
+        raise InputError(f"{waypoints}: no marks; {text}")
     if marks:
         return walked(field, marks, _accelerations(parts), step_m)
     if labels := field.find("x", "y") or field.find("lon", "lat"):
@@ -117,22 +113,19 @@ def _zipped(path: Path) -> Parts:
         with zipfile.ZipFile(path) as archive:
             for info in archive.infolist()[:MOST_PARTS]:
                 inside = Path(info.filename)
-                if inside.suffix.lower() not in (".csv", ".txt") or "meta" in map(
-                    str.lower, inside.parts[:-1]
-                ):
+                folders = map(str.lower, inside.parts[:-1])
+                if inside.suffix.lower() not in (".csv", ".txt") or "meta" in folders:
                     continue
                 with archive.open(info) as file:
                     content = file.read(most + 1)
                 if len(content) > most:
-                    raise InputError(
-                        f"{path}: {info.filename} is larger than {most:,} bytes; unpack the archive"
-                    )
+                    text = f"{info.filename} is larger than {most:,} bytes; unpack the archive"
+                    raise InputError(f"{path}: {text}")
                 if (table := _read(path / inside.name, content)) is not None:
                     parts[inside.stem] = table
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError, EOFError) as error:
-        raise InputError(
-            f"{path}: no archive of tables, or damaged ({str(error)[:100]}); unpack it"
-        ) from None
+        text = f"no archive of tables, or damaged ({str(error)[:100]}); unpack it"
+        raise InputError(f"{path}: {text}") from None
     return parts
 
 
@@ -169,11 +162,8 @@ def _field(path: Path, parts: Parts) -> tuple[str, Table]:
         raise InputError(f"{path}: no table of a magnetic field in it; it holds {', '.join(parts) or 'none'}")
     name, table = names[0], parts[names[0]]
     if name not in found and not {"x", "y", "z"} - set(table.names):
-        columns = (
-            Column(f"b{c.name}" if c.name in "xyz" else c.name, c.cells, c.path, c.lines)
-            for c in table.columns
-        )
-        table = Table(tuple(columns), table.notes, table.comments)
+        columns = (replace(c, name=f"b{c.name}" if c.name in "xyz" else c.name) for c in table.columns)
+        table = replace(table, columns=tuple(columns))
     return name, table
 
 
@@ -184,7 +174,7 @@ def _marks(parts: Parts, field: str) -> Marks | None:
             return marks
     table = parts[field]
     if (labels := table.find("x", "y")) and table.find("t") and not {"x", "y", "z"} <= set(table.names):
-        known = np.isfinite(np.column_stack([table.numbers(label) for label in labels])).all(axis=1)
+        known = np.isfinite([table.numbers(label) for label in labels]).all(axis=0)
         if 2 <= np.count_nonzero(known) < BETWEEN * table.rows:
             return marks_of(table)
     return None
@@ -229,10 +219,7 @@ def _filled(table: Table, labels: list[str]) -> Table:
     names = table.find("field") or table.find("bx", "by", "bz")
     if not names or not table.find("t"):
         return table
-    read, placed = (
-        np.isfinite(np.column_stack([table.numbers(name) for name in some])).all(axis=1)
-        for some in (names, labels)
-    )
+    read, placed = (np.isfinite([table.numbers(n) for n in some]).all(axis=0) for some in (names, labels))
     return table if (read & placed).any() or not placed.any() else _joined(table, table, labels)
 
 

@@ -1,8 +1,9 @@
 """Maps of surveys, from files to files: import, fit, validate."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -52,7 +53,8 @@ def import_survey(
     out, columns, about = check_free(out, force=force), reading.get("columns") or Columns(), about or About()
     name = about.name or out.stem
     table = out.suffix.lower() == ".parquet"
-    if not table and len(sources) == 1 and _is_grid(Path(sources[0]), columns):
+    unnamed = replace(columns, unit=None, scale=None) == Columns()
+    if not table and len(sources) == 1 and kind_of(Path(sources[0])) is SURVEY and unnamed:
         known = {**asdict(about), "name": name, "unit": columns.unit or "nT", "scale": columns.scale}
         field, report = read_folder(sources[0], **known, keep_stuck=reading.get("keep_stuck", False))
         save_map(field, out, force=force)
@@ -92,17 +94,9 @@ def fit_survey(
     out = check_free(out, force=force)
     options = _method_options([method], kernel, earth_nt).get(method, {})
     readings, report = survey_and_report(sources, keep_stuck=keep_stuck)
-    return _fitted(
-        readings.with_(name=out.stem),
-        out,
-        report,
-        method,
-        spacing_m=spacing_m,
-        headings_rad=headings_rad,
-        progress=progress,
-        force=force,
-        **options,
-    )
+    readings = readings.with_(name=out.stem)
+    grid: dict[str, Any] = {"spacing_m": spacing_m, "headings_rad": headings_rad}
+    return _fitted(readings, out, report, method, options, progress=progress, force=force, **grid)
 
 
 def _fitted(
@@ -110,12 +104,11 @@ def _fitted(
     out: Path,
     report: Report,
     method: str = "auto",
+    options: Mapping[str, Any] = MappingProxyType({}),
     *,
-    spacing_m: float | None = None,
-    headings_rad: Sequence[float] | None = None,
-    progress: Progress | None = None,
-    force: bool = False,
-    **options: Any,
+    progress: Progress | None,
+    force: bool,
+    **grid: Any,
 ) -> Report:
     """Fit a map to readings, write it, and report on it and on the readings."""
     from magtwin.field.fit.choice import choice_report
@@ -123,7 +116,7 @@ def _fitted(
 
     doubts = [*_doubts(readings), *_shared(readings, method)]
     model = fit(readings, method, progress=progress, **options)
-    field = raster(model, readings, spacing_m=spacing_m, headings_rad=headings_rad, progress=progress)
+    field = raster(model, readings, progress=progress, **grid)
     save_map(field, out, force=force)
     report = _with_doubts(report, [*doubts, *_masked(field)])
     return _joined(field.report(), choice_report(field.parameters), grid_report(field), report)
@@ -155,21 +148,15 @@ def validate_methods(
     return check(readings, chosen, split=split, options=options, progress=progress)
 
 
-def _is_grid(source: Path, columns: Columns) -> bool:
-    """Whether a source is a folder with one CSV per heading, whose columns need no names."""
-    return kind_of(source) is SURVEY and replace(columns, unit=None, scale=None) == Columns()
-
-
 def _doubts(readings: Readings) -> list[str]:
     """What makes a map of these readings doubtful; too few readings are refused."""
     from magtwin.field.fit.harmonic.problem import ONE_HEADING
 
     count, yaw, doubts = int(readings.good.sum()), readings.yaw[readings.good], list[str]()
     if readings.grid is None and count < LEAST_READINGS:
-        raise InputError(
-            f"{readings.name}: {count} of {len(readings)} readings are good{masked_words(readings)}; a map "
-            f"needs {LEAST_READINGS} at least, and some hundred to be of use"
-        )
+        text = f"a map needs {LEAST_READINGS} at least, and some hundred to be of use"
+        good = f"{count} of {len(readings)} readings are good{masked_words(readings)}"
+        raise InputError(f"{readings.name}: {good}; {text}")
     if readings.grid is None and count < USUAL_READINGS:
         doubts.append(f"only {count} good readings: the map is valid only next to them")
     if line := changes_line(readings):
@@ -188,13 +175,12 @@ def _doubts(readings: Readings) -> list[str]:
 def _masked(field: AnomalyMap) -> list[str]:
     """The doubt about a map that has hardly a node."""
     count, size = int(np.count_nonzero(~field.valid)), field.valid.size
-    if count <= MOST_MASKED * size:
-        return []
-    return [
+    doubt = (
         f"{count:,} of {size:,} nodes are masked: they are far from the readings, or the fit's standard "
         "deviation there is over half that of the readings; check headings and vectors, or take another "
         "--method"
-    ]
+    )
+    return [doubt] if count > MOST_MASKED * size else []
 
 
 def _with_doubts(report: Report, doubts: list[str]) -> Report:
@@ -240,10 +226,8 @@ def _method_options(
 ) -> dict[str, dict[str, Any]]:
     """Options by method; an option of a method that is not used is refused."""
     options: dict[str, dict[str, Any]] = {"auto": {}}
-    for name, option, value, method in (
-        ("kernel", "kernel", kernel, "gp"),
-        ("earth", "earth_nt", earth_nt, "harmonic"),
-    ):
+    given = {("kernel", "kernel", "gp"): kernel, ("earth", "earth_nt", "harmonic"): earth_nt}
+    for (name, option, method), value in given.items():
         if value is None:
             continue
         if not {method, "auto"} & set(methods):

@@ -22,7 +22,7 @@ from magtwin.io.formats import is_bag, read_run
 from magtwin.io.surveys.axes import levelled
 from magtwin.io.surveys.columns import Columns
 from magtwin.io.surveys.logs import is_log, table_of_log
-from magtwin.io.surveys.tabled import left_out, readings_of_table
+from magtwin.io.surveys.tabled import left_out, rows_of_table
 from magtwin.run.run import Run
 from magtwin.tables.table import PARQUET, read_table
 
@@ -76,7 +76,8 @@ def read_readings(
     parts, given, twice = [], dict[str, Source](), list[str]()
     topics = {POSE: pose_topic, MAGNITUDE: field_topic}
     for source in _each(sources):
-        same = given.setdefault(_identity(source), source)
+        path = Path(source)
+        same = given.setdefault(sha256(path) if path.is_file() else str(path.resolve()), source)
         if same is not source:
             twice.append(f"{source} and {same} as one, since their bytes are equal")
             continue
@@ -97,25 +98,23 @@ def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
     """
     field = next((c for c in ("b_measured_nt", "b_total_nt") if c in run and np.isfinite(run[c]).any()), None)
     if field is None:
-        raise InputError(
-            f"{source or 'run'}: b_measured_nt and b_total_nt hold no field, only nan or nothing"
-        )
+        text = "b_measured_nt and b_total_nt hold no field, only nan or nothing"
+        raise InputError(f"{source or 'run'}: {text}")
     b, p, yaw, t = run[field], run["p_world_base"], run["yaw"], run["t"]
     known = np.isfinite(b) & np.isfinite(p).all(axis=1) & np.isfinite(yaw) & np.isfinite(t)
     lost = run["flag_lost_lock"] if "flag_lost_lock" in run else np.zeros(len(b), bool)
-    body, about = None, ""
+    vector, about = None, ""
     if "bag" in run.metadata:
         known &= ~run["flag_pose_lost"]
         about = _recorded(run)
         if "b_vector_measured_nt" in run:
             vector = levelled(run["b_vector_measured_nt"], run["q_world_base_xyzw"], "body")
             known &= np.isfinite(vector).all(axis=1)
-            body = vector[known]
     return Readings(
         p_xy=p[known, :2],
         yaw=yaw[known],
         b_nt=b[known],
-        b_body_nt=body,
+        b_body_nt=None if vector is None else vector[known],
         t=t[known],
         good=~lost[known],
         runs=(name,),
@@ -146,20 +145,6 @@ def _each(sources: Sequence[Source]) -> Iterator[Source]:
             yield source
 
 
-def _first(source: Source) -> Path:
-    """The path of a source, or of the first of its joined files."""
-    path = Path(source)
-    if path.exists() or "+" not in str(source):
-        return expected(path, "source of readings")
-    return expected(Path(str(source).split("+")[0]), "source of readings")
-
-
-def _identity(source: Source) -> str:
-    """The checksum of a file; the place of a folder, or of joined files."""
-    path = Path(source)
-    return sha256(path) if path.is_file() else str(path.resolve())
-
-
 def _part(
     source: Source,
     columns: Columns,
@@ -169,7 +154,8 @@ def _part(
     step_m: float | None,
 ) -> Readings:
     """The readings of one source, by the kind of its file."""
-    path = _first(source)
+    first = source if Path(source).exists() else str(source).split("+")[0]
+    path = expected(Path(first), "source of readings")
     kind = kind_of(path)
     if kind is None and path.is_dir() and not is_log(path):
         kind = SURVEY  # whose reader tells what is missing
@@ -179,7 +165,7 @@ def _part(
         table = table_of_log(path, marks, step_m) if len(paths) == 1 else read_table(path)
         for other in paths[1:]:
             table = table.beside(read_table(other))
-        return readings_of_table(table, columns, path.stem, "; ".join(map(_sum, paths)))
+        return rows_of_table(table, columns, path.stem, "; ".join(map(_sum, paths)))[0]
     if waypoints is not None:
         raise InputError(f"{path}: its positions are known; leave out --waypoints", parameter="waypoints")
     if replace(columns, unit=None, scale=None) != Columns():
@@ -205,11 +191,9 @@ def _beside(first: Path, word: str) -> Path:
 
 def _together(parts: Sequence[Readings]) -> Readings:
     """Several surveys as runs of one."""
-    gridded = [part for part in parts if part.grid is not None]
-    if gridded:
-        raise InputError(
-            f"survey {gridded[0].name!r} is gridded and cannot be one of several sources; read it alone"
-        )
+    if gridded := [part.name for part in parts if part.grid is not None]:
+        text = "is gridded and cannot be one of several sources; read it alone"
+        raise InputError(f"survey {gridded[0]!r} {text}")
     first = np.cumsum([0] + [len(part.runs) for part in parts])
     arrays: dict[str, Any] = {"run": np.concatenate([p.run + n for p, n in zip(parts, first, strict=False)])}
     for key in ("p_xy", "yaw", "b_nt", "b_body_nt", "t", "good"):

@@ -64,9 +64,7 @@ def survey_and_report(
     if taken := taken_of(readings):
         report = replace(report, metadata={**report.metadata, "taken": taken})
     if not (keep_stuck or masked.good.any()):
-        raise InputError(
-            f"{sources[0]}: all {len(readings)} readings come from a sensor that was stuck; survey again, or "
-            "keep them with `keep_stuck=True`",
-            parameter="keep_stuck",
-        )
+        text = f"all {len(readings)} readings come from a sensor that was stuck"
+        advice = "survey again, or keep them with `keep_stuck=True`"
+        raise InputError(f"{sources[0]}: {text}; {advice}", parameter="keep_stuck")
     return (readings if keep_stuck else masked), report

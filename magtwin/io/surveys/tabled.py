@@ -22,21 +22,17 @@ from magtwin.tables.quantities import ANGLES, CLOCKWISE, DEGREES, FIELDS
 from magtwin.tables.table import Table, since_1970
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 LEAST_SPAN_M = 0.01  # Extent below which the report asks whether positions are in degrees [m]
 APART = 2.0  # Largest median ratio between vectors and magnitudes of the same table
 SAME_LENGTH = 0.01  # Largest median difference of x, y, z from the magnitude by which they are its components
 
 
-def readings_of_table(table: Table, told: Columns, name: str, source: str) -> Readings:
-    """The readings of `rows_of_table`."""
-    return rows_of_table(table, told, name, source)[0]
-
-
 def rows_of_table(table: Table, told: Columns, name: str, source: str) -> tuple[Readings, NDArray[np.bool_]]:
     """The readings in a table, of which the user `told` some columns, and which rows they are in.
 
-    Name and source are of its files.
+    Name and source are those of its files.
 
     Refused are a column that is missing, with the nearest name; a cell that is no number, with file and line;
     a field that is in no unit, and columns that contradict each other.
@@ -47,12 +43,8 @@ def rows_of_table(table: Table, told: Columns, name: str, source: str) -> tuple[
     vector, b = _field(table, columns)
     rounding = 0.0
     if turn is None and columns.heading == NO_HEADING and vector is not None and columns.axes != "world":
-        what = (
-            f"{columns.field} without {columns.vector}"
-            if columns.field
-            else f"the magnitude of {columns.vector}"
-        )
-        taken.append(f"{what}, since a sensor carried by hand has no heading")
+        what = f"{columns.field} without" if columns.field else "the magnitude of"
+        taken.append(f"{what} {columns.vector}, since a sensor carried by hand has no heading")
         if not columns.field:
             b, rounding = _within_steps(vector, b, taken)
         vector = None
@@ -66,8 +58,8 @@ def rows_of_table(table: Table, told: Columns, name: str, source: str) -> tuple[
         text = f"no row is complete; all {len(known)} have a cell that is empty or nan"
         raise InputError(f"{table.path}: {text}")
     _check_places(table, columns, p, known, taken)
-    turn = _upright(table, columns, turn, known)
-    _check_field(table, columns, told, p, b, known, taken)
+    turn = np.zeros(len(known)) if turn is None else _upright(table, columns, turn, known)
+    taken += _check_field(table, columns, told, p[known], b[known], np.flatnonzero(known))
     if vector is not None:
         _check_vectors(table, columns, vector[known], b[known], turn[known])
         vector = levelled(vector, turn, columns.axes or "body")[known]
@@ -211,15 +203,9 @@ def _with_field(table: Table, columns: Columns, taken: list[str]) -> Columns:
     """Columns with that of the magnitude found by name, else those of the components."""
     if found := table.find("field", apart={columns.x, columns.y}):
         return replace(columns, field=found[0])
-    three = (
-        table.find("bx", "by", "bz")
-        or [
-            label  # X_uT, Y_uT, Z_uT
-            for axis in "xyz"
-            for label in table.names
-            if split_label(label).words[:1] == (axis,) and unit_of(label, "bx") in FIELDS
-        ]
-    )
+    units = [label for label in table.names if unit_of(label, "bx") in FIELDS]  # X_uT, Y_uT, Z_uT
+    three = table.find("bx", "by", "bz")
+    three = three or [n for axis in "xyz" for n in units if split_label(n).words[:1] == (axis,)]
     if len(three) != 3:
         advice = "name the magnitude with --field NAME, or the components with --vector BX,BY,BZ"
         raise InputError(f"{table.path}: no column of the field {_seen(table)}; {advice}")
@@ -231,9 +217,8 @@ def _with_field(table: Table, columns: Columns, taken: list[str]) -> Columns:
 
 def _seen(table: Table) -> str:
     labels = ", ".join(column.name for column in table.columns if column.name)
-    if not labels:
-        return f"(no header: name columns by number, 1 to {len(table.columns)})"
-    return f"was found by its name (columns: {labels})"
+    none = f"(no header: name columns by number, 1 to {len(table.columns)})"
+    return f"was found by its name (columns: {labels})" if labels else none
 
 
 def _in_order(table: Table, columns: Columns, taken: list[str]) -> Columns:
@@ -249,8 +234,7 @@ def _in_order(table: Table, columns: Columns, taken: list[str]) -> Columns:
 
 def _check_roles(table: Table, columns: Columns) -> None:
     """Refuse a column of two roles, and x and y that are components of the field."""
-    roles = [("position", columns.x), ("position", columns.y)]
-    roles += [("time", columns.time)]
+    roles = [("position", columns.x), ("position", columns.y), ("time", columns.time)]
     roles += [("heading", columns.heading)] if columns.heading != NO_HEADING else []
     roles += [("orientation", name) for name in columns.several("quaternion")]
     roles += [("field", name) for name in (columns.field, *columns.several("vector"))]
@@ -261,10 +245,9 @@ def _check_roles(table: Table, columns: Columns) -> None:
         column = table.column(name)
         if other := seen.get(id(column)):
             both = f"{role} twice" if other == role else f"{other} and {role} at once"
-            raise InputError(
-                f"{table.path}: column {column.name or name!r} cannot be {both}; name other columns with "
-                "--x, --y, --heading, --quaternion, --field, --vector or --time"
-            )
+            advice = "--x, --y, --heading, --quaternion, --field, --vector or --time"
+            text = f"column {column.name or name!r} cannot be {both}; name other columns with {advice}"
+            raise InputError(f"{table.path}: {text}")
         seen[id(column)] = role
     z = next((label for label in table.names if split_label(label).words == ("z",)), "")
     places = [split_label(table.column(name).name).words for name in (columns.x, columns.y)]
@@ -277,10 +260,8 @@ def _check_roles(table: Table, columns: Columns) -> None:
     b = table.numbers(columns.field)
     known = np.isfinite(length) & (b > 0)
     if known.any() and np.median(np.abs(length[known] / b[known] - 1)) < SAME_LENGTH:
-        raise InputError(
-            f"{table.path}: {columns.x}, {columns.y} and {z} are the components of {columns.field}, no "
-            "positions; name those with --x and --y"
-        )
+        text = f"{columns.x}, {columns.y} and {z} are the components of {columns.field}, no positions"
+        raise InputError(f"{table.path}: {text}; name those with --x and --y")
 
 
 def _times(table: Table, columns: Columns, told: Columns, taken: list[str]) -> Array | None:
@@ -297,97 +278,79 @@ def _times(table: Table, columns: Columns, told: Columns, taken: list[str]) -> A
     return None
 
 
-def _check_places(
-    table: Table, columns: Columns, p: Array, known: NDArray[np.bool_], taken: list[str]
-) -> None:
+def _check_places(table: Table, columns: Columns, p: Array, known: Flags, taken: list[str]) -> None:
     """Refuse positions that are too far away; a note on ones whose unit is in doubt."""
-    away = np.flatnonzero(known & (np.abs(p) > FARTHEST_M).any(axis=1))
-    if len(away):
-        row = int(away[0])
+    if (away := known & (np.abs(p) > FARTHEST_M).any(axis=1)).any():
+        row = int(away.argmax())
         where = table.column(columns.x).where(row)
         raise InputError(f"{where}: x and y are metres, within {FARTHEST_M:g} of the origin, got {p[row]}")
     if table.unit(columns.x, "x") or table.unit(columns.y, "y"):
         return
     span = float(np.ptp(p[known], axis=0).max())
     if span > USUAL_SPAN_M:
-        taken.append(
-            f"x and y in metres, over {span:,.0f} m: if these are cm, write x [cm],y [cm] in the header"
-        )
+        doubt = f"{span:,.0f} m: if these are cm, write x [cm],y [cm] in the header"
+        taken.append(f"x and y in metres, over {doubt}")
     elif 0 < span < LEAST_SPAN_M and np.abs(p[known]).max() > 1:
-        taken.append(
-            f"x and y in metres, over {1e3 * span:.3g} mm only: if these are degrees, call them lon and lat"
-        )
+        doubt = f"{1e3 * span:.3g} mm only: if these are degrees, call them lon and lat"
+        taken.append(f"x and y in metres, over {doubt}")
 
 
-def _upright(table: Table, columns: Columns, turn: Array | None, known: NDArray[np.bool_]) -> Array:
-    """Headings, or quaternions of length 1; zeros for a sensor that was carried by hand."""
-    if turn is None:
-        return np.zeros(len(known))
+def _upright(table: Table, columns: Columns, turn: Array, known: NDArray[np.bool_]) -> Array:
+    """Headings, or quaternions of length 1."""
     if turn.ndim == 1:
         return turn
     length = np.linalg.norm(turn, axis=1)
-    off = np.flatnonzero(known & (np.abs(length - 1) > 0.01))
-    if len(off):
-        where = table.column(columns.several("quaternion")[0]).where(int(off[0]))
-        raise InputError(f"{where}: a quaternion's length is 1, got {length[off[0]]:.4g}")
+    if (off := known & (np.abs(length - 1) > 0.01)).any():
+        where = table.column(columns.several("quaternion")[0]).where(int(off.argmax()))
+        raise InputError(f"{where}: a quaternion's length is 1, got {length[off.argmax()]:.4g}")
     return np.asarray(turn / length[:, None])
 
 
 def _check_field(
-    table: Table,
-    columns: Columns,
-    told: Columns,
-    p: Array,
-    b: Array,
-    known: NDArray[np.bool_],
-    taken: list[str],
-) -> None:
+    table: Table, columns: Columns, told: Columns, p: Array, b: Array, rows: NDArray[np.intp]
+) -> list[str]:
     """Refuse magnitudes that cannot be a field; a note on a median that the Earth's field does not have."""
     magnitude = table.column(columns.field or columns.several("vector")[0])
-    zero = np.flatnonzero(known & (b <= 0))
-    if len(zero):
-        raise InputError(f"{magnitude.where(int(zero[0]))}: a magnitude is above 0, got {b[zero[0]]:g} nT")
+    if b.min() <= 0:
+        k = int(np.argmax(b <= 0))
+        raise InputError(f"{magnitude.where(int(rows[k]))}: a magnitude is above 0, got {b[k]:g} nT")
     warning = check_unit(
-        b[known],
+        b,
         str(table.path),
         magnitude.name or columns.field or columns.vector,
         columns.unit or "nT",
-        lambda k: magnitude.where(int(np.flatnonzero(known)[k])),
+        lambda k: magnitude.where(int(rows[k])),
         columns.scale,
         told=columns.unit is not None or columns.scale is not None,
-        p_xy=None if told.unit is not None or told.scale is not None else p[known],
+        p_xy=None if told.unit is not None or told.scale is not None else p,
     )
-    taken += [warning] if warning else []
+    return [warning] if warning else []
 
 
 def _check_vectors(table: Table, columns: Columns, vector: Array, b: Array, turn: Array) -> None:
     """Refuse vectors of another size than the magnitudes, and in other axes or headings than those given."""
     ratio = float(np.median(np.linalg.norm(vector, axis=1) / b))
     if not 1 / APART <= ratio <= APART:
-        raise InputError(
-            f"{table.path}: {columns.vector} is {ratio:.3g} times as long as {columns.field} (median); "
-            "give both in one unit, and the components of the whole field"
-        )
+        text = f"{columns.vector} is {ratio:.3g} times as long as {columns.field} (median)"
+        advice = "give both in one unit, and the components of the whole field"
+        raise InputError(f"{table.path}: {text}; {advice}")
     said = columns.axes or "body"
     best, kept = other_axes(vector, turn, said)
     if not best:
         return
     they = f"{table.path}: {columns.vector} are taken to be in {said} axes, but they keep one direction"
+    they += f" ({100 * kept:.0f} % of them)"
     if best != "mirrored":
-        raise InputError(
-            f"{they} ({100 * kept:.0f} % of them) in {best} axes, as the Earth's field does: give "
-            f"--axes {best}, or correct the headings or the order of the components"
-        )
+        advice = f"give --axes {best}, or correct the headings or the order of the components"
+        raise InputError(f"{they} in {best} axes, as the Earth's field does: {advice}")
     turned = "give --heading-unit compass for headings clockwise from north"
     if columns.quaternion:
         turned = "change the signs of x, y and z of a quaternion that turns world to body"
     elif columns.heading_unit == "compass":
         turned = "give --heading-unit deg for headings counter-clockwise from +x"
-    body_axes = "give --axes body, and " if said == "world" else ""
-    raise InputError(
-        f"{they} ({100 * kept:.0f} % of them) if headings turn the other way, or if they are forward, "
-        f"right, down: {body_axes}{turned}, or change the signs of the second and third component in the file"
-    )
+    turned = f"give --axes body, and {turned}" if said == "world" else turned
+    turned += ", or change the signs of the second and third component in the file"
+    raise InputError(f"{they} if headings turn the other way, or if they are forward, right, down: {turned}")
 
 
 def _turn(table: Table, columns: Columns) -> Array | None:
@@ -396,19 +359,16 @@ def _turn(table: Table, columns: Columns) -> Array | None:
         return np.column_stack([table.numbers(name) for name in columns.several("quaternion")])
     if columns.heading in ("", NO_HEADING):
         return None
-    name, heading = columns.heading, table.numbers(columns.heading)
+    heading = table.numbers(columns.heading)
     if columns.heading_unit == "deg":
         return np.radians(heading)
     if columns.heading_unit == "compass":
         return np.radians(90.0 - heading)
-    beyond = np.flatnonzero(np.abs(heading) > LARGEST_TURN)
-    if columns.heading_unit is None and len(beyond):
-        where = table.column(name).where(int(beyond[0]))
-        raise InputError(
-            f"{where}: heading {heading[beyond[0]]:g} is beyond a full turn in radians; "
-            "give --heading-unit deg (counter-clockwise from +x), compass (clockwise from north) or, if it "
-            "counts turns, rad"
-        )
+    if columns.heading_unit is None and (beyond := np.abs(heading) > LARGEST_TURN).any():
+        k = int(beyond.argmax())
+        text = f"heading {heading[k]:g} is beyond a full turn in radians; give --heading-unit deg"
+        text += " (counter-clockwise from +x), compass (clockwise from north) or, if it counts turns, rad"
+        raise InputError(f"{table.column(columns.heading).where(k)}: {text}")
     return heading
 
 
@@ -416,6 +376,6 @@ def _field(table: Table, columns: Columns) -> tuple[Array | None, Array]:
     """Vectors, if there are any, and magnitudes [nT], shapes (N, 3) and (N,)."""
     factor, names = nt_per(columns.unit, columns.scale), columns.several("vector")
     vector = factor * np.column_stack([table.numbers(name) for name in names]) if names else None
-    return vector, factor * table.numbers(columns.field) if vector is None or columns.field else (
-        np.linalg.norm(vector, axis=1)
-    )
+    if vector is not None and not columns.field:
+        return vector, np.linalg.norm(vector, axis=1)
+    return vector, factor * table.numbers(columns.field)

@@ -39,9 +39,8 @@ def columns_of_log(path: Path) -> Columns:
     try:
         import_module(library)
     except ImportError:
-        raise InputError(
-            f"{path}: such a log is read with {library}: pip install 'magtwin[vehicles]'"
-        ) from None
+        text = f"such a log is read with {library}: pip install 'magtwin[vehicles]'"
+        raise InputError(f"{path}: {text}") from None
     try:
         return read(path)
     except InputError:
@@ -70,8 +69,7 @@ def _px4(path: Path) -> Columns:
     if place := topics.get("vehicle_local_position"):
         at = place["timestamp"] / 1e6
         columns |= {"x [m]": between(t, at, place["y"]), "y [m]": between(t, at, place["x"])}
-    turn = topics.get("vehicle_attitude")
-    if turn is None:
+    if (turn := topics.get("vehicle_attitude")) is None:
         return columns | {"field [nT]": 1e5 * np.linalg.norm(gauss, axis=1)}
     q = np.column_stack([turn[f"q[{k}]"] for k in range(4)])  # w, x, y, z: body to north, east, down
     q *= np.cumprod(np.where(np.sum(q * np.roll(q, 1, axis=0), axis=1) < 0, -1, 1))[:, None]
@@ -83,17 +81,13 @@ def _ardupilot(path: Path) -> Columns:
     """DataFlash: the first compass [mG], the position and the attitude that ArduPilot estimated."""
     from pymavlink.DFReader import DFReader_binary
 
-    rows: dict[str, list[list[float]]] = {"MAG": [], "POS": [], "ATT": []}
-    labels = {
-        "MAG": ("TimeUS", "MagX", "MagY", "MagZ"),
-        "POS": ("TimeUS", "Lng", "Lat"),
-        "ATT": ("TimeUS", "Roll", "Pitch", "Yaw"),
-    }
+    labels = {"MAG": ("MagX", "MagY", "MagZ"), "POS": ("Lng", "Lat"), "ATT": ("Roll", "Pitch", "Yaw")}
+    rows: dict[str, list[list[float]]] = {kind: [] for kind in labels}
     log = DFReader_binary(str(path))
     while (message := log.recv_match(type=list(rows))) is not None:
         kind = message.get_type()
         if not getattr(message, "I", 0):
-            rows[kind].append([float(getattr(message, label)) for label in labels[kind]])
+            rows[kind].append([float(getattr(message, label)) for label in ("TimeUS", *labels[kind])])
     log.data_map.close()
     log.filehandle.close()
     if not rows["MAG"]:
@@ -124,9 +118,8 @@ def _flight(path: Path) -> Columns:
                 columns[label] = np.asarray(found[()], float)
     if "field [nT]" not in columns:
         held = ", ".join(sorted(known)[:12]) or "no data sets"
-        raise InputError(
-            f"{path}: no field in it under the names {', '.join(FLIGHT['field [nT]'])}; it has {held}"
-        )
+        tried = ", ".join(FLIGHT["field [nT]"])
+        raise InputError(f"{path}: no field in it under the names {tried}; it has {held}")
     rows = len(columns["field [nT]"])
     if "x [m]" in columns:
         columns.pop("lon", None), columns.pop("lat", None)
@@ -139,8 +132,5 @@ def _levelled(b: Array, q_ned_body: Array) -> Columns:
     Orientations xyzw are those of a body forward, right, down in axes north, east, down.
     """
     q = enu_from_ned(q_ned_body)
-    level = levelled(b * (1.0, -1.0, -1.0), q, "body")
-    return {
-        "yaw [rad]": yaw_from_quat(q),
-        **dict(zip(("bx [nT]", "by [nT]", "bz [nT]"), level.T, strict=True)),
-    }
+    bx, by, bz = levelled(b * (1.0, -1.0, -1.0), q, "body").T
+    return {"yaw [rad]": yaw_from_quat(q), "bx [nT]": bx, "by [nT]": by, "bz [nT]": bz}

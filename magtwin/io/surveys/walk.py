@@ -20,9 +20,7 @@ _PLACE = re.compile(r"\D*?([+-]?\d+(?:\.\d+)?)\s*[,;/ ]\s*(?:y\s*=?\s*)?([+-]?\d
 """A place in a note: `1.5,2`, `(1.5; 2)` or `x=1.5 y=2`."""
 
 LEAST_COVERED = 0.1  # Share of the log's time below which marks must be in another unit
-STEP_M_S2 = (
-    0.6  # Acceleration about its mean over a second beyond which a foot falls, and below which it rises
-)
+STEP_M_S2 = 0.6  # Acceleration about its mean over a second beyond which a foot falls, below which it rises
 STILL_M_S2 = 0.4  # Standard deviation of the acceleration within a second below which nobody walks [m/s^2]
 LEAST_PAUSE_S = 1.5  # Shortest pause that counts [s]
 
@@ -83,10 +81,8 @@ def walked(
         raise InputError(f"{table.path}: no column of time; marks are joined to readings by their times")
     t, _ = since_1970(table, name)
     begin, end = float(np.nanmin(t)), float(np.nanmax(t))
-    notes = [
-        f"places from {len(marks.p_xy)} marks of {marks.name}"
-        + ", at a steady pace between them" * (step_m is None)
-    ]
+    steady = ", at a steady pace between them" * (step_m is None)
+    notes = [f"places from {len(marks.p_xy)} marks of {marks.name}{steady}"]
     if step_m is not None and (marks.t is not None or moving is None or not step_m > 0):
         why = "has the times of its marks" if marks.t is not None else "needs a length above 0 m"
         why = why if moving or marks.t is not None else "needs a log with accelerations"
@@ -118,17 +114,14 @@ def _in_clock(at: Array, begin: float, end: float, table: Table, marks: Marks, n
     """Times of marks in the clock of a table, whose begin and end are given."""
     if at[-1] < begin or at[0] > end:
         if not -1 <= at[0] < at[-1] <= 1.05 * (end - begin) + 1:
-            raise InputError(
-                f"{table.path}: {begin:.10g} to {end:.10g} s, and {marks.name}: {at[0]:.10g} to "
-                f"{at[-1]:.10g} s, have no time in common; count both from the start of the log"
-            )
+            both = f"{begin:.10g} to {end:.10g} s, and {marks.name}: {at[0]:.10g} to {at[-1]:.10g} s"
+            text = f"{both}, have no time in common; count both from the start of the log"
+            raise InputError(f"{table.path}: {text}")
         at = at + begin
         notes.append(f"the times of {marks.name} from the start of {table.path.name}")
     if (covered := (min(at[-1], end) - max(at[0], begin)) / max(end - begin, 1e-9)) < LEAST_COVERED:
-        raise InputError(
-            f"{table.path}: {marks.name} covers {100 * covered:.2g} % of its {end - begin:.6g} s; "
-            "give both times in one unit, such as t [ms]"
-        )
+        text = f"{marks.name} covers {100 * covered:.2g} % of its {end - begin:.6g} s"
+        raise InputError(f"{table.path}: {text}; give both times in one unit, such as t [ms]")
     return at
 
 
@@ -145,8 +138,7 @@ def _steps(t: Array, acceleration: Array) -> Array:
 
 def _moved(t: Array, stills: list[tuple[float, float]]) -> Array:
     """Time on the move until each time [s], without pauses."""
-    rest = sum((np.clip(t, a, b) - a for a, b in stills), start=np.zeros(len(t)))
-    return np.asarray(t - rest)
+    return np.asarray(t - sum((np.clip(t, a, b) - a for a, b in stills), start=np.zeros(len(t))))
 
 
 def _stills(t: Array, acceleration: Array) -> list[tuple[float, float]]:
@@ -176,11 +168,9 @@ def _quiet(table: Table, t: Array) -> list[tuple[float, float]]:
     change = np.abs(mean[window:] - mean[:-window])
     if noise == 0 or np.median(change) < LIVELY * noise:
         return []
-    edges = (t[window // 2 :])[: len(change) + 1]
-    return _pauses(edges, change < QUIET * noise)
+    return _pauses(t[window // 2 :][: len(change) + 1], change < QUIET * noise)
 
 
 def _pauses(edges: Array, flags: NDArray[np.bool_]) -> list[tuple[float, float]]:
     """Begin and end of the stretches of flags of `LEAST_PAUSE_S` or more."""
-    pairs = edges[stretches(flags)].tolist()
-    return [(a, b) for a, b in pairs if b - a >= LEAST_PAUSE_S]
+    return [(a, b) for a, b in edges[stretches(flags)].tolist() if b - a >= LEAST_PAUSE_S]
