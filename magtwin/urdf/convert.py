@@ -49,6 +49,9 @@ from magtwin.usd.layers import describe_stage
 JOINTS = "joints"
 """Scope of the joints below the robot's prim."""
 
+PROOF = "magtwin.urdf.proof"
+"""Module of `Options.proof`, which few conversions need."""
+
 THUMBNAILS = Path(".thumbs", "256x256")
 """Folder of an asset's thumbnail, relative to the asset's folder."""
 
@@ -171,6 +174,9 @@ class _Author:
     finish: Finish | None
     ledger: Ledger = field(default_factory=Ledger)
 
+    def __post_init__(self) -> None:
+        self.tags = Tags(self.description)
+
     def stage(self, aside: Path, layer: str) -> tuple[Usd.Stage, ConversionReport]:
         """Author the robot in one layer at `aside`, and compare it with its description."""
         stage, description, options = Usd.Stage.CreateNew(str(aside)), self.description, self.options
@@ -179,6 +185,8 @@ class _Author:
             description.note(note)
         checksum = sha256(description.path)
         report = make_report(description, stage, self.ledger, name=self.out.name, sha256=checksum)
+        if options.proof:
+            report = replace(report, proof=import_module(PROOF).make_proof(self.tags, stage, self.ledger))
         description.repairs.check(report.source, strict=options.strict)
         notes = Vt.StringArray(description.repairs.notes)
         stage.GetRootLayer().customLayerData = {
@@ -200,21 +208,20 @@ class _Author:
         if names[""] != description.name:
             description.note(f"{description.name!r} is called {names['']!r} in USD")
         names |= _free_names(description.links, {JOINTS, LOOKS, VISUALS, COLLISIONS}, "", description)
-        mechanism, tags = read_mechanism(description, self.options), Tags(description)
+        mechanism, tags = read_mechanism(description, self.options), self.tags
         check_rules(mechanism, self.options)
-        base, commands = read_base(tags, self.options.controllers), read_commands(tags, mechanism)
+        base = read_base(tags, self.options.controllers)
         surfaces = read_surfaces(tags)
         driven: tuple[str, ...] = ()
         if self.options.profile == "diff-drive":
             base = find_base(mechanism, base)
             driven = base.wheels
             surfaces = grip(mechanism, driven, surfaces)
-            commands = not_on(driven, commands)
         places = place_links(mechanism, merge=self.options.merge_fixed)
         fixed = self.options.fix_base or (
             base is None and self.options.profile == "general" and mechanism.in_world(_base(places))
         )
-        options = replace(self.options, drives=(*self.options.drives, *commands), fix_base=fixed)
+        options = replace(self.options, fix_base=fixed)
         poses = mechanism.poses()
         robot = _define(stage, Sdf.Path.absoluteRootPath.AppendChild(names[""]), description.name)
         stage.SetDefaultPrim(robot)
@@ -231,10 +238,13 @@ class _Author:
                 for visual in carried(link.visuals, pose, part, name):
                     rider.visuals.append(define_visual(body, visual, description, self.meshes, layer))
                     ledger.visuals.add(rider.visuals[-1].GetPath())
+                    ledger.show(visual, rider.visuals[-1])
                 for collision in carried(link.collisions, pose, part, name):
                     rider.colliders.append(define_collider(body, collision, surface, self.meshes, layer))
+                    ledger.show(collision, rider.colliders[-1])
                 parts.append(rider)
-            define_body(body, parts, description)
+            filled = define_body(body, parts, description, options.density)
+            mechanism.filled.update({part: solid.moved(poses[name]) for part, solid in filled.items()})
             colliders[name] = [collider for part in parts for collider in part.colliders]
             if not colliders[name]:
                 define_no_contact(body, surfaces.get(name, Surface()), self.meshes)
@@ -246,6 +256,8 @@ class _Author:
                 became = "frame" if is_marker(description.links[name]) else "merged"
                 ledger.bodies[name] = became, frame.GetPath()
         wheels = fit_wheels(mechanism, driven, bodies) if driven else NO_WHEELS
+        commands = not_on(driven, read_commands(tags, mechanism))
+        options = replace(options, drives=(*options.drives, *commands))
         joints = self._joints(stage, mechanism, options, wheels, places, paths)
         robot.AddAppliedSchema(ROBOT_API)
         jointed = [stage.GetPrimAtPath(joint) for joint in joints]

@@ -6,6 +6,7 @@ one `Repairs`, and `check` decides what `Options.strict` refuses.
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from xml.etree.ElementTree import Element
 
 from magtwin.errors import InputError, find
 
@@ -113,6 +114,9 @@ class Repairs:
 
     supplies: dict[str, None] = field(default_factory=dict)
     """Options of the command line that would supply what is missing, such as `--package arm=FOLDER`."""
+
+    about: dict[Element, list[tuple[str, str]]] = field(default_factory=dict)
+    """Kinds and texts of repairs by the element with the fault."""
 
     suggested: int = 0
     """Names so far for which a near one was looked for."""

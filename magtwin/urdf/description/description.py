@@ -75,6 +75,9 @@ class Description:
     repairs: Repairs = field(default_factory=Repairs)
     """Every repair, loss and guess of a conversion."""
 
+    checked: dict[Element, Element] = field(default_factory=dict)
+    """What became of each element of links, joints and materials that is used."""
+
     @cached_property
     def joint_names(self) -> frozenset[str]:
         """Names of all joints."""
@@ -144,6 +147,8 @@ class Description:
         """
         element = self._find(*about) if isinstance(about, tuple) else about
         self.repairs.add(kind, text, self.source.place(element))
+        if element is not None:
+            self.repairs.about.setdefault(element, []).append((kind, text))
 
     def refused(self, kind: str, name: str, text: str) -> InputError:
         """An error with the line of the link or joint called `name`."""
@@ -188,7 +193,9 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
     check_names(source, description.repair)
     description = replace(description, name=source.xml.attrib["name"])
     clean = [
-        check_grammar(part, description.where, description.repair) for part in source.xml if part.tag in PARTS
+        check_grammar(part, description.where, description.repair, description.checked)
+        for part in source.xml
+        if part.tag in PARTS
     ]
     _report_unknown(description)
     links = [read_link(e) for e in clean if e.tag == "link"]
