@@ -25,6 +25,7 @@ from magtwin.urdf.meshes.mesh_layer import MeshLayer, free_name, gather
 from magtwin.urdf.meshes.texture import TEXTURES
 from magtwin.urdf.options import DEFAULTS, Options
 from magtwin.urdf.physics.articulation import define_articulation, filter_overlaps
+from magtwin.urdf.physics.contact import define_contacts
 from magtwin.urdf.physics.control import read_base, read_commands
 from magtwin.urdf.physics.drive import NO_WHEELS, Wheels, check_rules
 from magtwin.urdf.physics.gazebo import (
@@ -255,10 +256,13 @@ class _Author:
                 frame.AddAppliedSchema(SITE_API)
                 became = "frame" if is_marker(description.links[name]) else "merged"
                 ledger.bodies[name] = became, frame.GetPath()
+        drive = self._drive(base, mechanism, bodies, tags)
         wheels = fit_wheels(mechanism, driven, bodies) if driven else NO_WHEELS
         commands = not_on(driven, read_commands(tags, mechanism))
         options = replace(options, drives=(*options.drives, *commands))
         joints = self._joints(stage, mechanism, options, wheels, places, paths)
+        planes = _planes(drive, base, mechanism)
+        define_contacts(robot, {stage.GetPrimAtPath(ledger.joints[n]): y for n, y in planes.items()})
         robot.AddAppliedSchema(ROBOT_API)
         jointed = [stage.GetPrimAtPath(joint) for joint in joints]
         held = any(robot.GetPath() in UsdPhysics.Joint(joint).GetBody0Rel().GetTargets() for joint in jointed)
@@ -270,7 +274,7 @@ class _Author:
             relationship = robot.CreateRelationship(f"isaac:physics:{name}", custom=False)
             for path in paths_listed:  # each is prepended, so that a stronger layer can add to the list
                 relationship.AddTarget(path)
-        self._equip(robot, tags, options, self._drive(base, mechanism, bodies, tags), held)
+        self._equip(robot, tags, options, drive, held)
         return robot
 
     def _drive(
@@ -372,6 +376,19 @@ class _Author:
         if count:
             most = ", ".join(sorted(ledger.unknown_tags, key=lambda tag: -ledger.unknown_tags[tag])[:4])
             tags.description.note(f"{count} tags without a meaning here are kept as text, such as {most}")
+
+
+def _planes(
+    drive: DriveSpec | None, base: MobileBase | None, mechanism: Mechanism
+) -> dict[str, float | None]:
+    """Y of the plane in which each wheel of a drive touches the floor [m]; None for that of its joint."""
+    if drive is None or base is None:
+        return {}
+    joints = mechanism.description.joints.values()
+    held = {joint.child for joint in joints if joint.name in base.steered}
+    planes = {joint.name: None for joint in joints if joint.parent in held and joint.type == "continuous"}
+    exact, half = base.kind in ("differential", "car"), drive.wheel_separation_m / 2  # else an effective one
+    return planes | {name: half * (1 - 2 * side) if exact else None for name, side in drive.sides.items()}
 
 
 def _base(places: dict[str, Place]) -> str:

@@ -83,6 +83,9 @@ NAMESPACES = (
 )
 """Layer of a property by the start of its name."""
 
+PLACED = ("specifier", "typeName", "apiSchemas", "variantSetNames", "variantSelection", "primOrder")
+"""Metadata of a prim that are authored apart from the others."""
+
 LONG = 64
 """Longest array in a layer of text; usd-validation-nvidia refuses longer ones."""
 
@@ -135,6 +138,12 @@ def split(flat: Sdf.Layer) -> dict[str, Sdf.Layer]:
     parts = {name: Sdf.Layer.CreateAnonymous(f"{name}.usda") for name in ("interface", *FILES)}
     with Sdf.ChangeBlock():
         _Splitter(flat, parts).route(robot)
+    for name in [variants.name for variants in robot.variantSets]:  # of contacts
+        home = _prim(parts["physics"], robot.path)
+        home.variantSetNameList.prependedItems.append(name)
+        home.variantSelections[name] = robot.variantSelections[name]
+        variants = robot.path.AppendVariantSelection(name, "")
+        Sdf.CopySpec(flat, variants, parts["physics"], variants)
     if not parts["arrays"].rootPrims:
         del parts["arrays"]
     for name, layer in parts.items():
@@ -158,7 +167,7 @@ class _Splitter:
         if spec.typeName:
             home.typeName = spec.typeName
         for key in spec.ListInfoKeys():
-            if key not in ("specifier", "typeName", "apiSchemas"):
+            if key not in PLACED:
                 home.SetInfo(key, spec.GetInfo(key))
         if owner == "instances" and spec.name in SHAPES:
             scope = _prim(self.parts["instances"], INSTANCES)

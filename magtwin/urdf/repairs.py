@@ -72,7 +72,7 @@ FAULTS: Mapping[str, tuple[str, str]] = {
     "mesh-missing": ("missing mesh", "a box of the link's size as a placeholder"),
     "mesh-unreadable": ("mesh that cannot be read", "a box of the link's size as a placeholder"),
     "mesh-flat": ("flat collision mesh", "thickened to a thin plate"),
-    "file-name": ("package path with odd slashes, or path relative to the package", "read as meant"),
+    "file-name": ("path with odd slashes, or of a file that lies elsewhere", "read as meant"),
     "package-missing": ("missing package of $(find)", "files in it count as missing"),
     "include-renamed": (
         "missing include with the suffix .xacro or .urdf.xacro, beside a file with the other",

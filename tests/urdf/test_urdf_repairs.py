@@ -218,8 +218,8 @@ FAULTY = {
     ],
     "mesh-flat": [(meshed("flat.stl", "collision"), 2, "as a plate 0.0071 m")],
     "file-name": [
-        (meshed("parts/box.stl"), 2, "is found in the package, not beside"),
-        (meshed("package:///arms/flat.stl"), 2, "'package://arms/"),
+        (meshed("parts/box.stl"), 2, "'parts/box.stl' is read as '"),
+        (meshed("package:///arms/flat.stl"), 2, "is read as '"),
     ],
     "drive-incomplete": [
         (wheels(left="jj", right="j"), 9, "<left_joint>: no joint 'jj'; did you mean 'j'"),

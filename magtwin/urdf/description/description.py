@@ -5,7 +5,6 @@ the XML.
 """
 
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -34,11 +33,6 @@ from magtwin.urdf.repairs import LOSS, NOTE, Repairs
 from magtwin.urdf.source.source import Source, read_source
 
 Element = ElementTree.Element
-
-_SCHEME = re.compile(r"^(package|model):/*")
-
-_NAMELESS = re.compile(r"^(package|model):///")
-"""A path without a package, such as `package:///meshes/arm.stl`."""
 
 JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "planar", "floating")
 """Types of joints that can be converted."""
@@ -98,29 +92,11 @@ class Description:
         return self.source.where(element)
 
     def find_file(self, filename: str, what: str) -> Path:
-        """The file that a `filename=` refers to, see `Source.find_file`.
-
-        Backslashes, too many or too few slashes after a scheme, and names relative to the package are
-        repaired. A path that names no package, with three slashes, may lead to a file beside the description.
-        """
-        element = self.source.elements.get(("", filename))
-        name = filename.replace("\\", "/")
-        usual = _SCHEME.sub(r"\1://", name)
-        rest = usual.partition("://")[2]
-        is_beside = "/" not in rest or os.path.isfile(self.path.parent / rest)  # noqa: PTH113, which may raise
-        if _NAMELESS.match(name) and is_beside:
-            usual = rest
-        if usual != filename:
-            self.repair("file-name", f"{what} {filename!r} is read as {usual!r}", element)
+        """The file that a `filename=` refers to, see `Source.find_file`."""
         try:
-            path = self.source.find_file(usual, what, element)
+            return self.source.find_file(filename, what, self.source.elements.get(("", filename)))
         finally:
             self._take_notes()
-        if ":" not in usual and not (self.path.parent / usual).is_file():
-            self.repair(
-                "file-name", f"{what} {filename!r} is found in the package, not beside the file", element
-            )
-        return path
 
     def mesh_element(self, filename: str) -> Element | None:
         """The first `<mesh>` of a file."""
