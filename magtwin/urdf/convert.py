@@ -19,7 +19,15 @@ from magtwin.spec.drive import DriveSpec
 from magtwin.urdf.description.description import Description, origin_of, read_description
 from magtwin.urdf.description.extensions import MODULES
 from magtwin.urdf.description.tag import Tags
-from magtwin.urdf.layout import GEOMETRIES, PAYLOADS, check_payloads, write_layers
+from magtwin.urdf.layout import (
+    EDITS,
+    GEOMETRIES,
+    PAYLOADS,
+    check_payloads,
+    keep_edits,
+    lost_edits,
+    write_layers,
+)
 from magtwin.urdf.material import LOOKS
 from magtwin.urdf.meshes.mesh_layer import MeshLayer, free_name, gather
 from magtwin.urdf.meshes.texture import TEXTURES
@@ -135,6 +143,7 @@ def _write_payloads(author: "_Author", out: Path, force: bool) -> ConversionRepo
         if author.meshes.textures:
             author.meshes.textures.export(work / TEXTURES)
         write_layers(stage.GetRootLayer(), aside, work, out)
+        keep_edits(out.parent, stage.GetDefaultPrim().GetName())
         shutil.move(work, aside_folder)
     return report
 
@@ -184,6 +193,8 @@ class _Author:
         robot = self._robot(stage, layer)
         for note in self.finish(robot) if self.finish else ():
             description.note(note)
+        for path in () if options.single_file else lost_edits(self.out.parent, stage):
+            description.note(f"{EDITS} edits <{path}>, which this conversion does not have", lost=True)
         checksum = sha256(description.path)
         report = make_report(description, stage, self.ledger, name=self.out.name, sha256=checksum)
         if options.proof:

@@ -1,6 +1,7 @@
 """Layout: split one authored layer into the layers of Isaac Sim's asset structure 3.0.
 
     robot.usda                      interface: references base, variant set Physics
+    edits.usda                      the user's changes; a sublayer of the interface, and never written again
     payloads/base.usda              links, frames and sensors with their poses and looks
     payloads/instances.usda         visuals and colliders of each link
     payloads/geometries.usdc        triangles
@@ -19,10 +20,10 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from pxr import Sdf, UsdUtils
+from pxr import Sdf, Usd, UsdUtils
 
 from magtwin.errors import InputError
-from magtwin.files.outputs import check_free
+from magtwin.files.outputs import check_free, output
 from magtwin.urdf.material import LOOKS
 from magtwin.urdf.shape import COLLISIONS, VISUALS
 from magtwin.usd.layers import open_layer
@@ -32,6 +33,9 @@ PAYLOADS = "payloads"
 """Folder of the layers beside the interface."""
 
 GEOMETRIES = "geometries.usdc"
+
+EDITS = "edits.usda"
+"""Layer of the user's changes, which a new conversion keeps."""
 
 VARIANT_SET = "Physics"
 
@@ -109,6 +113,31 @@ def check_payloads(out: Path, *, force: bool) -> Path:
             whose = f"is of {owner}" if owner else "was not made by a conversion"
             raise InputError(f"{folder}: {whose}; give each robot its own folder")
     return check_free(folder, force=force)
+
+
+def keep_edits(folder: Path, robot: str) -> None:
+    """Write an empty layer for the user's changes to the prim `robot`, unless the folder has one."""
+    if not (folder / EDITS).exists():
+        layer = Sdf.Layer.CreateAnonymous(EDITS)
+        layer.documentation = f"{robot}: your changes. A new conversion keeps this file."
+        layer.defaultPrim = _prim(layer, Sdf.Path.absoluteRootPath.AppendChild(robot)).name
+        with output(folder / EDITS) as aside:
+            layer.Export(str(aside))
+
+
+def lost_edits(folder: Path, stage: Usd.Stage) -> list[str]:
+    """Paths of the outermost prims that the user's changes in a folder edit and a stage does not have."""
+    lost: list[Sdf.Path] = []
+    layer = open_layer(folder / EDITS) if (folder / EDITS).exists() else None
+
+    def visit(path: Sdf.Path) -> None:
+        over = path.IsPrimPath() and layer.GetPrimAtPath(path).specifier == Sdf.SpecifierOver
+        if over and not stage.GetPrimAtPath(path):
+            lost.append(path)
+
+    if layer is not None:
+        layer.Traverse(Sdf.Path.absoluteRootPath, visit)
+    return [str(path) for path in sorted(lost) if path.GetParentPath() not in lost]
 
 
 def write_layers(flat: Sdf.Layer, out: Path, folder: Path, final: Path) -> None:
@@ -269,6 +298,7 @@ def _describe(layer: Sdf.Layer, flat: Sdf.Layer, name: str, robot: str) -> None:
     if name == "interface":
         layer.documentation, layer.customLayerData = flat.documentation, flat.customLayerData
         layer.defaultPrim = robot
+        layer.subLayerPaths.append(f"./{EDITS}")
         return
     layer.defaultPrim = {"instances": INSTANCES.name, "materials": LOOKS}.get(name, robot)
     if not layer.GetPrimAtPath(Sdf.Path.absoluteRootPath.AppendChild(layer.defaultPrim)):
@@ -304,7 +334,7 @@ def _compose(parts: dict[str, Sdf.Layer], robot: Sdf.PrimSpec) -> None:
 
 def _moved(here: Path, final: Path, home: Path) -> Callable[[str], str]:
     """A function that converts asset paths from the temporary folder `here` to the final layer `home`."""
-    own = {f"./{path}" for path in FILES.values()} | {"./physics.usda"}
+    own = {f"./{path}" for path in FILES.values()} | {"./physics.usda", f"./{EDITS}"}
     own |= {f"./{PAYLOADS}/{path}" for path in (*VARIANTS.values(), FILES["base"]) if path}
 
     def seen(path: str) -> str:

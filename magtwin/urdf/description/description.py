@@ -34,6 +34,9 @@ from magtwin.urdf.source.source import Source, read_source
 
 Element = ElementTree.Element
 
+WORLD = "world"
+"""Root link that is the world."""
+
 JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "planar", "floating")
 """Types of joints that can be converted."""
 
@@ -181,6 +184,10 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
                 text = f"link {link.name!r}: a {role} {kind} of size 0 is left out"
                 description.repair("shape-empty", text, ("link", link.name))
     joints = _leading(description, links, [read_joint(e) for e in clean if e.tag == "joint"])
+    parents = {joint.parent for joint in joints} - {link.name for link in links}
+    if WORLD in parents:
+        description.note(f"link {WORLD!r} is held by a joint and missing: it is added")
+        links.append(Link(WORLD, None, (), ()))
     materials = _materials(description, [e for e in clean if e.tag == "material"])
     held = {joint.child: joint for joint in joints}
     description = replace(

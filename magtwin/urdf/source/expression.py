@@ -132,7 +132,7 @@ _UNBOUNDED = ("factorial", "comb", "perm", "prod", "lcm")
 
 MATH = {name: f for name, f in vars(math).items() if not name.startswith("_") and name not in _UNBOUNDED}
 MATH |= {"factorial": lambda n: math.factorial(_bounded(n)), "prod": _prod}
-MATH |= {"comb": lambda n, k: math.comb(_bounded(n), k), "perm": lambda n, k=None: math.perm(_bounded(n), k)}
+MATH |= {"comb": lambda n, k: math.comb(_bounded(n), k), "perm": lambda n, *k: math.perm(_bounded(n), *k)}
 
 _PLAIN = (
     *(abs, all, any, bool, dict, divmod, float, int, len, list, max, min, ord, repr, sorted, str, tuple),
@@ -403,8 +403,10 @@ class _Interpreter:
         """Values of the entries of a list or call; those with a star are unpacked."""
         values: list[Any] = []
         for node in nodes:
-            starred = isinstance(node, ast.Starred)
-            values += _entries(self.value(node.value)) if starred else [self.value(node)]
+            if isinstance(node, ast.Starred):
+                values += _entries(self.value(node.value))
+            else:
+                values.append(self.value(node))
             _check_length(len(values))
         return values
 

@@ -60,9 +60,9 @@ class Packages:
         folders = (self._folder, *self._folder.parents)
         self._above = [p for p in folders if (p / MANIFEST).is_file()]
         trusted = [p for p in folders if p in self._above or (p / ".git").exists()]
-        if root is not None and self._folder.is_relative_to(root.resolve()):
-            trusted.append(root.resolve())
-        self.home = trusted[0] if trusted else self._folder
+        whole = (Path.home(), folders[-1])  # of a user, and of a machine
+        trusted += [p for p in folders if root is not None and p == root.resolve() and p not in whole]
+        self.home: Path = trusted[0] if trusted else self._folder
         """Folder that the file may read: the nearest above it with `package.xml` or `.git`, or `root`, or its
         own."""
         beside = self._folder.parent if not trusted and self._folder.name in SUBFOLDERS else None
@@ -123,7 +123,7 @@ class Packages:
         """
         path, installed = path.resolve(), self._installed.values()
         allowed = (self.home, *self._given.values(), *self._beside, *installed, *allowed_folders())
-        if any(path.is_relative_to(folder) for folder in allowed):
+        if any(path.is_relative_to(str(folder)) for folder in allowed):
             return True
         return any(path.is_relative_to(p) for folders in self._search().values() for p in folders)
 
