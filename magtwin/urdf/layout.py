@@ -127,16 +127,17 @@ def keep_edits(folder: Path, robot: str) -> None:
 
 def lost_edits(folder: Path, stage: Usd.Stage) -> list[str]:
     """Paths of the outermost prims that the user's changes in a folder edit and a stage does not have."""
+    if not (folder / EDITS).exists():
+        return []
     lost: list[Sdf.Path] = []
-    layer = open_layer(folder / EDITS) if (folder / EDITS).exists() else None
+    layer = open_layer(folder / EDITS)
 
     def visit(path: Sdf.Path) -> None:
         over = path.IsPrimPath() and layer.GetPrimAtPath(path).specifier == Sdf.SpecifierOver
         if over and not stage.GetPrimAtPath(path):
             lost.append(path)
 
-    if layer is not None:
-        layer.Traverse(Sdf.Path.absoluteRootPath, visit)
+    layer.Traverse(Sdf.Path.absoluteRootPath, visit)
     return [str(path) for path in sorted(lost) if path.GetParentPath() not in lost]
 
 

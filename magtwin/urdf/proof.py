@@ -175,10 +175,9 @@ class _Proof:
         part, tags = way[1], [e.tag for e in way]
         name = part.get("name", "")
         if part.tag == "joint":
-            child = self._description.joints and next(
-                (c for c, joint in self._description.joints.items() if joint.name == name), None
-            )
-            return None if child is None else self._owner(name if name in self._ledger.joints else child)
+            children = {joint.name: child for child, joint in self._description.joints.items()}
+            owner = name if name in self._ledger.joints else children.get(name)
+            return None if owner is None else self._owner(owner)
         if "material" in tags:
             return self._look(way)
         if len(way) == 2 or tags[2] not in ("visual", "collision", "inertial"):

@@ -77,39 +77,25 @@ def _sum(values: Any, start: float = 0) -> float:
 class _Set(list[Any]):
     """A set in the order of its entries' first mention, so that output is reproducible."""
 
-    def __sub__(self, other: Any) -> "_Set":
-        left_out = dict.fromkeys(other)
-        return _Set(value for value in self if value not in left_out)
-
-    def __and__(self, other: Any) -> "_Set":
-        kept = dict.fromkeys(other)
-        return _Set(value for value in self if value in kept)
-
-    def __or__(self, other: Any) -> "_Set":
-        return _Set(dict.fromkeys([*self, *other]))
-
-    def __xor__(self, other: Any) -> "_Set":
-        return (self - other) | (_Set(other) - self)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, list) and len(self) == len(other) and not self ^ other
-
-    def __le__(self, other: list[Any]) -> bool:
-        return not self - other
-
-    def __lt__(self, other: list[Any]) -> bool:
-        return self <= other and len(self) < len(other)
-
-    def __ge__(self, other: list[Any]) -> bool:
-        return not _Set(other) - self
-
-    def __gt__(self, other: list[Any]) -> bool:
-        return self >= other and len(self) > len(other)
-
     __hash__ = None  # type: ignore[assignment]
 
     def __repr__(self) -> str:
         return f"{{{', '.join(map(repr, self))}}}" if self else "set()"
+
+
+def _operation(name: str) -> Callable[[_Set, Any], Any]:
+    """An operator of sets for `_Set`: a set in order, or whether it compares so."""
+
+    def apply(left: _Set, right: Any) -> Any:
+        both = dict.fromkeys([*left, *right]) if isinstance(right, list) else {}
+        made = getattr(set(left), name)(set(right) if isinstance(right, list) else right)
+        return _Set(entry for entry in both if entry in made) if isinstance(made, set) else made
+
+    return apply
+
+
+for _name in ("and", "or", "sub", "xor", "eq", "le", "lt", "ge", "gt"):
+    setattr(_Set, f"__{_name}__", _operation(f"__{_name}__"))
 
 
 def _bounded(count: int) -> int:
