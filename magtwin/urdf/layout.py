@@ -23,6 +23,7 @@ from pathlib import Path
 from pxr import Sdf, Usd, UsdUtils
 
 from magtwin.errors import InputError
+from magtwin.files.file import read_bytes
 from magtwin.files.outputs import check_free, output
 from magtwin.urdf.material import LOOKS
 from magtwin.urdf.shape import COLLISIONS, VISUALS
@@ -115,19 +116,29 @@ def check_payloads(out: Path, *, force: bool) -> Path:
     return check_free(folder, force=force)
 
 
+NO_EDITS = """#usda 1.0
+(
+    defaultPrim = "{robot}"
+    doc = "{robot}: your changes. A new conversion keeps this file."
+)
+
+over "{robot}"
+{{
+}}
+"""
+
+
 def keep_edits(folder: Path, robot: str) -> None:
     """Write an empty layer for the user's changes to the prim `robot`, unless the folder has one."""
     if not (folder / EDITS).exists():
-        layer = Sdf.Layer.CreateAnonymous(EDITS)
-        layer.documentation = f"{robot}: your changes. A new conversion keeps this file."
-        layer.defaultPrim = _prim(layer, Sdf.Path.absoluteRootPath.AppendChild(robot)).name
         with output(folder / EDITS) as aside:
-            layer.Export(str(aside))
+            aside.write_text(NO_EDITS.format(robot=robot), encoding="utf-8")
 
 
 def lost_edits(folder: Path, stage: Usd.Stage) -> list[str]:
     """Paths of the outermost prims that the user's changes in a folder edit and a stage does not have."""
-    if not (folder / EDITS).exists():
+    empty = NO_EDITS.format(robot=stage.GetDefaultPrim().GetName()).encode()
+    if not (folder / EDITS).is_file() or read_bytes(folder / EDITS, "layer", "USD text") == empty:
         return []
     lost: list[Sdf.Path] = []
     layer = open_layer(folder / EDITS)
