@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 
-from magtwin.author.from_urdf import from_urdf
+from magtwin.author.from_urdf import from_urdf, write_urdf
 from magtwin.errors import InputError
 from magtwin.files.folders import allow
 
@@ -82,6 +82,10 @@ def test_masses_sets_the_world_and_looks(tmp_path):
 def test_a_driven_wheel_rolls_on_a_thin_cylinder_or_as_described(tmp_path, single_file):
     out = tmp_path / ("robot.usda" if single_file else "robot")
     made = from_urdf(CASES / "wide_wheels.urdf", out, profile="diff-drive", single_file=single_file)
+    write_urdf(made.asset, tmp_path / "back.urdf")
+    back = (tmp_path / "back.urdf").read_text()
+    assert 'length="0.05"' in back
+    assert 'length="0.002"' not in back
     stage = Usd.Stage.Open(str(made.asset))
     robot = stage.GetDefaultPrim()
     assert robot.GetChildren()[0].GetName() == "base_link"

@@ -102,6 +102,7 @@ class Packages:
             for parent in (self._folder, *self._folder.parents[:DEPTH]):
                 for path in (parent, parent / name):
                     if path.name == name and (path == self._folder or _looks_like_package(path)):
+                        self._installed[name] = path.resolve()
                         return path
             folder = self._installed.get(name) or _installed(name)
             if folder is not None:
