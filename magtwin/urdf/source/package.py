@@ -133,7 +133,7 @@ class Packages:
             self._found, left = {}, FOLDERS
             for folder in self._above:
                 _add(folder, self._found)
-            for base in [p.parent for p in self._above] or [self.home]:
+            for base in [p.parent for p in self._above] or dict.fromkeys((self._folder, self.home)):
                 for folder in _below(base, DEPTH):
                     left -= 1
                     if left < 0:
