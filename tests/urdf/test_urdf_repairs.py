@@ -350,7 +350,8 @@ def test_packages_of_ros_are_found_by_the_name_in_the_description_and_only_so(tm
 
 
 def test_a_folder_of_meshes_beside_a_folder_urdf_is_read_and_nothing_else_there(tmp_path):
-    for folder in ("urdf", "meshes", "secret"):
+    (tmp_path / "urdf").mkdir()
+    for folder in ("meshes", "secret"):
         (tmp_path / folder).mkdir()
         trimesh.creation.box().export(tmp_path / folder / "a.stl")
     path = tmp_path / "urdf" / "arm.urdf"

@@ -109,14 +109,15 @@ class Source:
         if separator and scheme not in (*SCHEMES, "file"):
             raise MissingFileError(f"{start} has scheme {scheme!r}; known: file, model, package")
         written, unknown = self._as_written(filename)
-        for path in ([] if written is None else [written], self._others(filename)):
-            inside = [p for p in path if self.packages.holds(p) and p.is_file()]
-            if inside:
-                if inside[0] != written or "\\" in filename or _ODD.match(filename):
-                    near_by = Path(os.path.relpath(inside[0], self.path.resolve().parent)).as_posix()
-                    text = f"{what} {filename!r} is read as {near_by!r}"
-                    self.repairs.add("file-name", text, self.place(element))
-                return inside[0]
+        found = written if written and self.packages.holds(written) and written.is_file() else None
+        others = () if found else self._others(filename)
+        found = found or next((p for p in others if os.path.isfile(p) and self.packages.holds(p)), None)  # noqa: PTH113
+        if found is not None:
+            if found != written or "\\" in filename or _ODD.match(filename):
+                shown = Path(os.path.relpath(found, self.path.resolve().parent)).as_posix()
+                text = f"{what} {filename!r} is read as {shown!r}"
+                self.repairs.add("file-name", text, self.place(element))
+            return found
         if unknown is not None:
             missing = MissingFileError(f"{start} is in a package: {unknown}")
             missing.supply, missing.near = unknown.supply, unknown.near
@@ -169,7 +170,7 @@ class Source:
         above = [folder.joinpath(*tail) for tail in tails for folder in folders if tail]
         packages = {folder for some in known.values() for folder in some}
         held = {folder.joinpath(*tail) for tail in tails if tail for folder in packages}
-        single = [path for path in held if path.is_file()]
+        single = [path for path in held if os.path.isfile(path)]  # noqa: PTH113, which may raise
         return [*rooted, *beside, *above, *(single if len(single) == 1 else ())]
 
 
