@@ -33,7 +33,6 @@ from magtwin.urdf.meshes.mesh_layer import MeshLayer, free_name, gather
 from magtwin.urdf.meshes.texture import TEXTURES
 from magtwin.urdf.options import DEFAULTS, Options
 from magtwin.urdf.physics.articulation import define_articulation, filter_overlaps
-from magtwin.urdf.physics.contact import define_contacts
 from magtwin.urdf.physics.control import read_base, read_commands
 from magtwin.urdf.physics.drive import NO_WHEELS, Wheels, check_rules
 from magtwin.urdf.physics.gazebo import (
@@ -57,9 +56,6 @@ from magtwin.usd.layers import describe_stage
 
 JOINTS = "joints"
 """Scope of the joints below the robot's prim."""
-
-PROOF = "magtwin.urdf.proof"
-"""Module of `Options.proof`, which few conversions need."""
 
 THUMBNAILS = Path(".thumbs", "256x256")
 """Folder of an asset's thumbnail, relative to the asset's folder."""
@@ -198,7 +194,9 @@ class _Author:
         checksum = sha256(description.path)
         report = make_report(description, stage, self.ledger, name=self.out.name, sha256=checksum)
         if options.proof:
-            report = replace(report, proof=import_module(PROOF).make_proof(self.tags, stage, self.ledger))
+            report = replace(
+                report, proof=import_module(MODULES["proof"]).make_proof(self.tags, stage, self.ledger)
+            )
         description.repairs.check(report.source, strict=options.strict)
         notes = Vt.StringArray(description.repairs.notes)
         stage.GetRootLayer().customLayerData = {
@@ -273,7 +271,9 @@ class _Author:
         options = replace(options, drives=(*options.drives, *commands))
         joints = self._joints(stage, mechanism, options, wheels, places, paths)
         planes = _planes(drive, base, mechanism)
-        define_contacts(robot, {stage.GetPrimAtPath(ledger.joints[n]): y for n, y in planes.items()})
+        if planes:
+            wheeled = {stage.GetPrimAtPath(ledger.joints[n]): y for n, y in planes.items()}
+            import_module(MODULES["drive"]).define_contacts(robot, wheeled)
         robot.AddAppliedSchema(ROBOT_API)
         jointed = [stage.GetPrimAtPath(joint) for joint in joints]
         held = any(robot.GetPath() in UsdPhysics.Joint(joint).GetBody0Rel().GetTargets() for joint in jointed)

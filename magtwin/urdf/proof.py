@@ -10,6 +10,7 @@ from magtwin.urdf.repairs import UNKNOWN
 from magtwin.urdf.report import FATES, Ledger, ProofLine
 from magtwin.usd.schema import attribute_name
 
+TURNS = ("physics:localRot0", "xformOp:orient", "physics:principalAxes")
 SIZES = ("xformOp:scale", "radius", "height", "points", "extent")
 DRIVES = tuple(f"drive:{axis}:physics:maxForce" for axis in ("angular", "linear", "transX", "rotX", "rotZ"))
 CARRIERS: Mapping[str, tuple[str, ...]] = {
@@ -111,7 +112,9 @@ class _Proof:
         if way[1].tag not in ("link", "joint", "material"):
             return self._tag(way)
         clean, given = self._description.checked.get(element), element.get(name[1:], "")
-        same = not name or (clean is not None and _words(given) == clean.get(name[1:]))
+        same = not name or (
+            clean is not None and given.replace(",", " ").split() == clean.get(name[1:], "").split()
+        )
         if clean is None or not same:
             repair = self._repair(way, name)
             return ("repaired", None, repair) if repair else ("lost", None, "left out")
@@ -127,7 +130,9 @@ class _Proof:
         table = next((CARRIERS[k] for k in (f"{element.tag}/{name[1:]}", element.tag) if k in CARRIERS), None)
         if not name or table is None:
             return "used", prim, ""
-        shown = _property(prim, _wanted(table, element.tag, name[1:]))
+        if element.tag == "origin" and name == "@xyz":
+            table = tuple(n for n in table if n not in TURNS)
+        shown = _property(prim, table)
         if shown:
             return "used", *shown
         still = way[1].tag == "joint" and not prim.HasAPI(UsdPhysics.DriveAPI)
@@ -187,6 +192,10 @@ class _Proof:
             while prim and not prim.HasAPI(UsdPhysics.RigidBodyAPI):
                 prim = prim.GetParent()
             return prim or None
+        return self._shape(way)
+
+    def _shape(self, way: tuple[Element, ...]) -> Usd.Prim | None:
+        """Prim of the visual or collision that holds an element."""
         path = self._ledger.shapes.get(self._description.checked.get(way[2], way[2]))
         return self._stage.GetPrimAtPath(path) if path else None
 
@@ -195,28 +204,9 @@ class _Proof:
         material = next(e for e in way if e.tag == "material")
         scope = self._robot.GetPrimAtPath(LOOKS)
         name = Tf.MakeValidIdentifier(material.get("name", "")) if material.get("name") else ""
-        looks = (
-            [prim for prim in scope.GetChildren() if name and prim.GetName().startswith(name)]
-            if scope
-            else []
-        )
-        if looks or way[1].tag == "material":
-            return looks[0] if looks else None
-        path = self._ledger.shapes.get(self._description.checked.get(way[2], way[2]))
-        return self._stage.GetPrimAtPath(path) if path else None
-
-
-def _words(text: str) -> str:
-    return " ".join(text.replace(",", " ").split())
-
-
-def _wanted(names: tuple[str, ...], tag: str, attribute: str) -> tuple[str, ...]:
-    """The properties that can carry an attribute; those of a turn do not carry a place."""
-    turns = attribute in ("rpy", "quat_xyzw")
-    if tag != "origin":
-        return names
-    places = ("translate", "Pos0", "centerOfMass", "points")
-    return tuple(n for n in names if turns or n.endswith(places))
+        all_looks = scope.GetChildren() if scope and name else []
+        looks = [prim for prim in all_looks if prim.GetName().startswith(name)]
+        return looks[0] if looks else None if way[1].tag == "material" else self._shape(way)
 
 
 def _property(prim: Usd.Prim, names: tuple[str, ...]) -> tuple[Usd.Prim, str] | None:
