@@ -26,8 +26,8 @@ import ovphysx
 import ovstage
 from ovphysx.types import GlobalConfigKey, SimObjectType
 
-SETTLE_S = 0.5
-"""Time for which the robot settles before it is driven [s]."""
+SETTLE_S = 2.0
+"""Time for which the robot settles before it is driven [s]: it tilts onto its casters for about one."""
 
 SCHEMAS = ("PhysxSchema", "OmniUsdPhysicsDeformableSchema")
 """Folders of physx-usd-schemas; PhysX refuses to start without both."""
