@@ -138,7 +138,7 @@ def _write_payloads(author: "_Author", out: Path, force: bool) -> ConversionRepo
         stage, report = author.stage(aside, f"./{PAYLOADS}/{GEOMETRIES}")
         if author.meshes.textures:
             author.meshes.textures.export(work / TEXTURES)
-        write_layers(stage.GetRootLayer(), aside, work, out)
+        write_layers(stage.GetRootLayer(), aside, work, out, edits=True)
         keep_edits(out.parent, stage.GetDefaultPrim().GetName())
         shutil.move(work, aside_folder)
     return report

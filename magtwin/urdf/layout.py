@@ -152,7 +152,7 @@ def lost_edits(folder: Path, stage: Usd.Stage) -> list[str]:
     return [str(path) for path in sorted(lost) if path.GetParentPath() not in lost]
 
 
-def write_layers(flat: Sdf.Layer, out: Path, folder: Path, final: Path) -> None:
+def write_layers(flat: Sdf.Layer, out: Path, folder: Path, final: Path, *, edits: bool = False) -> None:
     """Write an authored layer as an asset of layers.
 
     Args:
@@ -160,8 +160,11 @@ def write_layers(flat: Sdf.Layer, out: Path, folder: Path, final: Path) -> None:
         out: Interface layer to write.
         folder: Folder for the other layers; contains the geometries already.
         final: Final path of `out`, beside PAYLOADS.
+        edits: Whether EDITS lies beside it.
     """
     parts = split(flat)
+    if edits:
+        parts["interface"].subLayerPaths.append(f"./{EDITS}")
     for name, layer in parts.items():
         path = out if name == "interface" else folder / FILES[name]
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -310,7 +313,6 @@ def _describe(layer: Sdf.Layer, flat: Sdf.Layer, name: str, robot: str) -> None:
     if name == "interface":
         layer.documentation, layer.customLayerData = flat.documentation, flat.customLayerData
         layer.defaultPrim = robot
-        layer.subLayerPaths.append(f"./{EDITS}")
         return
     layer.defaultPrim = {"instances": INSTANCES.name, "materials": LOOKS}.get(name, robot)
     if not layer.GetPrimAtPath(Sdf.Path.absoluteRootPath.AppendChild(layer.defaultPrim)):
