@@ -65,7 +65,7 @@ def features(out: Path) -> dict[str, str]:
     """What a written robot has, read with plain OpenUSD."""
     from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
 
-    root = next(iter(sorted(out.glob("*.usda"))))
+    root = next(iter(sorted(p for p in out.glob("*.usda") if p.name != "edits.usda")))
     stage = Usd.Stage.Open(str(root))
     prims = list(Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()))
     bodies = [p for p in prims if p.HasAPI(UsdPhysics.RigidBodyAPI)]

@@ -44,8 +44,14 @@ REST_S, TURN_RAD, STOP_S = 5.0, math.pi, 0.5
 MOST_MOVED_M, MOST_SUNK_M, LEAST_UPRIGHT = 0.002, 0.005, 0.999
 """A robot at rest moves and sinks or rises by less [m], and the cosine of its tilt is above."""
 
-SHARE = 0.08
+AHEAD_SHARE, TURN_SHARE = 0.02, 0.03
 """Largest relative error of a distance and of an angle."""
+
+ASIDE_M = 0.08
+"""Most that a robot leaves its line, or its place in a turn [m]."""
+
+WIDER = 1.5
+"""Radius of a car's turn over the smallest one."""
 
 ADVICE = "look at the colliders of its wheels and of the floor, at their friction, and at its drives"
 
@@ -175,25 +181,41 @@ def _drives(world: WorldProcess, robot: Mapping[str, Any]) -> Finding:
     ahead = (end[0] - x) * math.cos(yaw) + (end[1] - y) * math.sin(yaw)
     aside = abs((end[1] - y) * math.cos(yaw) - (end[0] - x) * math.sin(yaw))
     text = f"went {ahead:.3f} m of {AHEAD_M:g} m at {speed:g} m/s, {1e3 * aside:.1f} mm to a side"
-    return _finding("drives", text, robot, abs(ahead / AHEAD_M - 1) < SHARE and aside < SHARE * AHEAD_M)
+    return _finding("drives", text, robot, abs(ahead / AHEAD_M - 1) < AHEAD_SHARE and aside < ASIDE_M)
 
 
 def _turns(world: WorldProcess, robot: Mapping[str, Any]) -> Finding:
-    """Whether a robot turns in place as much as its wheels turn."""
+    """Whether a robot turns in place as much as its wheels turn; a car, on a circle by its steering."""
     last = world.ask(robot["start"])
-    start, turned, w = last, 0.0, min(RATE_RAD_S, robot["w_max"])
-    rate = w * robot["wheel_separation_m"] / 2 / robot["wheel_radius_m"]
-    seconds, parts = TURN_RAD / w, 8
+    start, turned, w, ahead = last, 0.0, min(RATE_RAD_S, robot["w_max"]), 0.0
+    if robot["steers"]:
+        circle = WIDER * robot["turning_radius_m"]
+        ahead = min(SPEED_M_S, robot["v_max"])
+        w = ahead / circle
+        world.ask({path: sense * math.atan2(x, circle - y) for path, x, y, sense in robot["steers"]})
+        last = world.ask(_steps(2 * STOP_S, 0.0, 0.0))
+    apart = w * robot["wheel_separation_m"] / 2
+    rates = [(ahead + side * apart) / robot["wheel_radius_m"] for side in (-1, 1)]
+    seconds, parts = TURN_RAD / w, 8 * math.ceil(TURN_RAD / w * max(map(abs, rates)) / 80)
     for part in range(parts + 1):
-        left = _steps(seconds / parts, -rate, rate) if part < parts else _steps(STOP_S, 0.0, 0.0)
+        left = _steps(seconds / parts, *rates) if part < parts else _steps(STOP_S, 0.0, 0.0)
         seen = world.ask(left)
         turned += (seen[2] - last[2] + math.pi) % math.tau - math.pi
         last = seen
-    moved, share = math.dist(start[:2], last[:2]), turned / TURN_RAD
+    moved, share = math.dist(_axle(start, robot), _axle(last, robot)), turned / TURN_RAD
+    if robot["steers"]:
+        moved -= 2 * circle
+    room = ASIDE_M + 0.1 * ahead / w  # a car ends on the other side of its circle
     text = f"turned {turned:.3f} rad of {TURN_RAD:.3f} rad at {w:g} rad/s, and moved {1e3 * moved:.1f} mm"
-    if not robot["turns"]:  # its wheels scrub, by how much depends on the floor
+    if not (robot["turns"] or robot["steers"]):  # its wheels scrub, by how much depends on the floor
         return _finding("turns", f"{text}; its wheels scrub as it turns", robot, good=True)
-    return _finding("turns", text, robot, abs(share - 1) < SHARE and moved < SHARE * AHEAD_M)
+    return _finding("turns", text, robot, abs(share - 1) < TURN_SHARE and abs(moved) < room)
+
+
+def _axle(seen: list[float], robot: Mapping[str, Any]) -> tuple[float, float]:
+    """Where the middle of the axle is [m]."""
+    c, s, (x, y) = math.cos(seen[2]), math.sin(seen[2]), robot["axle"]
+    return seen[0] + c * x - s * y, seen[1] + s * x + c * y
 
 
 def _steps(seconds: float, left: float, right: float) -> list[list[float]]:

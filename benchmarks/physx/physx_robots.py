@@ -5,13 +5,13 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdPhysics
+from pxr import Gf, Usd, UsdGeom, UsdPhysics
 
-from magtwin.author.shape import drive_of, footprint_of, sense_of, wheels_of
+from magtwin.author.shape import drive_of, footprint_of, sense_of, solid_box, wheels_of
 from magtwin.spec.drive import DriveSpec
 from magtwin.spec.obstacles import Obstacles
 from magtwin.usd.attributes import targets
-from magtwin.usd.geometry import BASE_LINK
+from magtwin.usd.geometry import BASE_LINK, axis_of
 from magtwin.usd.lab.obstacles import read_obstacles
 from magtwin.usd.schema import attribute_name, has_api
 from magtwin.usd.sensors import JOINT_FIELDS, WHEELS_FIELDS, joints_of, read_drive
@@ -27,6 +27,10 @@ MARGIN_M = 0.05
 
 FAR_M, SPACING_M, HEADINGS = 10.0, 0.25, 12
 """Places to look for room: up to this distance from the robot, on a grid, in this number of directions."""
+
+
+Steer = tuple[str, float, float, int]
+"""A joint that steers."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,14 @@ class DrivenRobot:
     turns: bool
     """Whether it turns on the spot without scrubbing: two wheels that are not steered."""
 
+    axle: tuple[float, float]
+    """Middle of the driven wheels in the base's axes [m]."""
+
+    steers: tuple[Steer, ...]
+    """Joints that steer: path, place ahead and left of `axle` [m], and -1 if the axis points down."""
+
+    turning_radius_m: float
+
     start: tuple[float, float, float]
     """x [m], y [m] and yaw [rad] of its base: at the robot if there is room for `AHEAD_M`, or near it."""
 
@@ -56,7 +68,7 @@ class DrivenRobot:
     """Height of its base [m]."""
 
     lowest_m: float
-    """Height of the lowest point of its wheels [m]."""
+    """Height of the lowest point of its enabled colliders [m]."""
 
     wheel_radius_m: float
     wheel_separation_m: float
@@ -86,7 +98,7 @@ def read_driven(stage: Usd.Stage) -> list[DrivenRobot]:
         spec, joints = drives[prim]
         others = np.array([pose[:2] for other, pose in places.items() if other != prim]).reshape(-1, 2)
         height = _height(base)
-        wheels = [wheel.lowest_m for wheel in wheels_of(prim)]
+        middle = np.mean([_place(stage.GetPrimAtPath(joint), base) for joint in joints], axis=0)
         found.append(
             DrivenRobot(
                 prim=str(prim.GetPath()),
@@ -95,9 +107,12 @@ def read_driven(stage: Usd.Stage) -> list[DrivenRobot]:
                 sides=tuple(spec.sides.values()),
                 senses=tuple(sense_of(stage.GetPrimAtPath(joint), base) for joint in joints),
                 turns=len(joints) == 2 and not spec.turning_radius_m,
+                axle=(float(middle[0]), float(middle[1])),
+                steers=_steers(prim, base, middle) if spec.turning_radius_m else (),
+                turning_radius_m=spec.turning_radius_m,
                 start=find_room(obstacles, places[prim], footprint_of(prim) or 0.0, others),
                 height_m=height,
-                lowest_m=_height(prim) + min(wheels, default=0.0),
+                lowest_m=_height(prim) + float(solid_box(prim, prim).GetMin()[2]),
                 wheel_radius_m=spec.wheel_radius_m,
                 wheel_separation_m=spec.wheel_separation_m,
                 v_max=spec.v_max,
@@ -171,6 +186,28 @@ def _drive(robot: Usd.Prim) -> tuple[DriveSpec, tuple[str, ...]] | None:
         return None
     prims = joints_of(robot)
     return drive, tuple(str(prims[name].GetPath()) for name in names)
+
+
+def _place(joint: Usd.Prim, base: Usd.Prim) -> np.ndarray:
+    """Place of a joint's child in the base's axes [m], shape (3,)."""
+    body = joint.GetStage().GetPrimAtPath(UsdPhysics.Joint(joint).GetBody1Rel().GetTargets()[0])
+    return np.array(UsdGeom.XformCache().ComputeRelativeTransform(body, base)[0].ExtractTranslation())
+
+
+def _steers(robot: Usd.Prim, base: Usd.Prim, middle: np.ndarray) -> tuple[Steer, ...]:
+    """The joints of a car that steer: driven, with limits, about a vertical axis, carrying a wheel."""
+    stage, found = robot.GetStage(), []
+    joints = [p for p in Usd.PrimRange(robot) if p.IsA(UsdPhysics.RevoluteJoint)]
+    held = {str(t) for p in joints for t in UsdPhysics.Joint(p).GetBody0Rel().GetTargets()}
+    for prim in joints:
+        (body,) = UsdPhysics.Joint(prim).GetBody1Rel().GetTargets()
+        way = UsdGeom.XformCache().ComputeRelativeTransform(stage.GetPrimAtPath(body), base)[0]
+        up = way.TransformDir(Gf.Vec3d(*axis_of(UsdPhysics.Joint(prim))))[2]
+        high = UsdPhysics.RevoluteJoint(prim).GetUpperLimitAttr().Get()
+        if abs(up) > 0.8 and str(body) in held and high is not None and math.isfinite(high):
+            x, y, _ = _place(prim, base) - middle
+            found.append((str(prim.GetPath()), float(x), float(y), 1 if up > 0 else -1))
+    return tuple(found)
 
 
 def _base(robot: Usd.Prim) -> Usd.Prim:

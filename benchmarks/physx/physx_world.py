@@ -6,8 +6,9 @@ In: a line of JSON, `{"stage", "base", "joints": [left, right, ...], "sides": [0
 [1, -1, ...], "start": [x, y, yaw] or null, "step_s"}`. Paths name prims. A side is 0 (left) or 1 (right);
 default: 0 and 1. A sense is -1 for a wheel that rolls backward as its joint's angle grows; default: 1.
 Then a line per answer: a list with the rates of both sides [rad/s], a pair per physics step, or `[x, y, yaw]`
-to place the robot there at rest. Out: a line after the robot has settled and one after each line in: x, y,
-yaw, v, w, the angles of the first two wheels, height of the base [m], and z of its up axis.
+to place the robot there at rest, or `{"joint": target [rad]}` to steer. Out: a line after the robot has
+settled and one after each line in: x, y, yaw, v, w, the angles of the first two wheels, height of the base
+[m], and z of its up axis.
 
 PhysX reads attributes only of schemas that are registered first: those of the packages physx-usd-schemas and
 newton-usd-schemas.
@@ -23,10 +24,10 @@ from typing import Any
 import numpy as np
 import ovphysx
 import ovstage
-from ovphysx.types import SimObjectType
+from ovphysx.types import GlobalConfigKey, SimObjectType
 
-SETTLE_S = 0.5
-"""Time for which the robot settles before it is driven [s]."""
+SETTLE_S = 2.0
+"""Time for which the robot settles before it is driven [s]: it tilts onto its casters for about one."""
 
 SCHEMAS = ("PhysxSchema", "OmniUsdPhysicsDeformableSchema")
 """Folders of physx-usd-schemas; PhysX refuses to start without both."""
@@ -43,6 +44,7 @@ BASE = ("position", "orientation", "linearVelocity", "angularVelocity")
 def open_stage(file: str) -> tuple[Any, Any]:
     """PhysX on the CPU with a stage, and the stage, which must be kept as long."""
     ovphysx.PhysX.set_cpu_mode(True)
+    ovphysx.api.set_global_config(GlobalConfigKey.NUM_THREADS, 0)  # one thread steps one robot fastest
     physx = ovphysx.PhysX()
     package = metadata.distribution("physx-usd-schemas")
     folders = [str(package.locate_file(f"physx_usd_schemas/{name}/resources")) for name in SCHEMAS]
@@ -74,14 +76,14 @@ class World:
 
     def __init__(self, job: dict[str, Any]) -> None:
         """Load it and let the robot settle at its start."""
-        self._physx, self._stage = open_stage(job["stage"])
+        self.physx, self._stage = open_stage(job["stage"])
         self._step_s, self._base, self._joints = job["step_s"], job["base"], job["joints"]
         self._sides = job.get("sides", (0, 1))
         self._senses = job.get("senses", [1] * len(self._joints))
         self._rates = [math.nan, math.nan]
         self._raw, self._angles = [0.0, 0.0], [0.0, 0.0]
         for kind, path in ((LINK, self._base), *((JOINT, joint) for joint in self._joints)):
-            if not self._physx.query(kind, pattern=path, metadata=True).wait().metadata.total_prim_count:
+            if not self.physx.query(kind, pattern=path, metadata=True).wait().metadata.total_prim_count:
                 raise ValueError(f"PhysX has no articulation with {path}")
         self.place(*(job["start"] or self.seen()[:3]))
 
@@ -115,7 +117,7 @@ class World:
                 if pair[side] != self._rates[side]:
                     self._write(JOINT, joint, "jointVelocityTarget", [math.degrees(sense * pair[side])])
             self._rates = list(pair)
-            self._physx.step_sync(self._step_s)
+            self.physx.step_sync(self._step_s)
 
     def seen(self) -> list[float]:
         """x, y, yaw, v, w, wheel angles, height, and how upright it is.
@@ -136,14 +138,14 @@ class World:
 
     def _read(self, kind: SimObjectType, path: str, name: str) -> list[float]:
         """An attribute of a prim."""
-        values = read(self._physx, kind, path, name)
+        values = read(self.physx, kind, path, name)
         if not all(map(math.isfinite, values)):
             raise ValueError(f"{path} is lost: its {name} is {values}")
         return values
 
     def _write(self, kind: SimObjectType, path: str, name: str, values: list[float]) -> None:
         """Set an attribute of a prim."""
-        write(self._physx, kind, path, name, values)
+        write(self.physx, kind, path, name, values)
 
 
 def main() -> None:
@@ -154,7 +156,10 @@ def main() -> None:
     out.write(json.dumps(world.seen()) + "\n")
     for line in sys.stdin:
         asked = json.loads(line)
-        if asked and isinstance(asked[0], list):
+        if isinstance(asked, dict):
+            for joint, angle in asked.items():
+                write(world.physx, JOINT, joint, "jointPositionTarget", [math.degrees(angle)])
+        elif asked and isinstance(asked[0], list):
             world.step(asked)
         else:
             world.place(*asked)

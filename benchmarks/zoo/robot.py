@@ -9,6 +9,7 @@ import json
 import re
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -35,6 +36,7 @@ def convert(job: dict, row: dict):
         arguments=job["arguments"],
         fix_base=job["fix_base"],
         force=True,
+        proof=True,
         **job["options"],
     )
     report = made.report
@@ -48,6 +50,7 @@ def convert(job: dict, row: dict):
         "meshes_absent": sum(line.count for line in report.repairs if line.kind == "mesh-missing"),
         "boxes": boxes(report),
         "mass_kg": report.mass_out_kg,
+        "fates": dict(Counter(line.fate for line in report.proof)),
     }
     return made
 

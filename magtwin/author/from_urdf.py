@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from magtwin.errors import InputError
 from magtwin.files.kinds import expected
 from magtwin.files.outputs import output
 from magtwin.urdf.convert import convert_with_report
+from magtwin.urdf.layout import EDITS
 from magtwin.urdf.options import DEFAULTS, DriveRule, Options
 from magtwin.urdf.report import ConversionReport
 
@@ -88,6 +90,8 @@ def from_urdf(
     with nullcontext() if one_file else output(out, force=force) as folder:
         if folder is not None:
             folder.mkdir()
+            if (Path(out) / EDITS).is_file():  # of the asset that this one replaces
+                shutil.copyfile(Path(out) / EDITS, folder / EDITS)
         place = asset if folder is None else folder / name
         how: dict[str, Any] = {"options": options, "thumbnail": thumbnail, "force": force}
         if equipped is None:

@@ -22,6 +22,7 @@ from magtwin.spec.robot import RobotSpec
 from magtwin.spec.sensors import BatterySpec, ImuSpec, LidarSpec, MagnetometerSpec, MocapSpec
 from magtwin.urdf.convert import convert_with_report
 from magtwin.urdf.options import DEFAULTS, Options
+from magtwin.urdf.physics.contact import define_contacts
 from magtwin.urdf.report import ConversionReport
 from magtwin.urdf.reroot import reroot
 from magtwin.usd.geometry import BASE_LINK
@@ -37,6 +38,7 @@ from magtwin.usd.sensors import (
     define_lidar,
     define_magnetometer,
     define_on_root,
+    joints_of,
     read_drive,
 )
 
@@ -207,7 +209,12 @@ def _equip(robot: Usd.Prim, settings: RobotSettings) -> list[str]:
         drive, found = _drive(robot, settings.drive or DriveSpec())
         define_drive(robot, drive)
         notes += found
-    notes += stand_on_floor(robot, read_drive(robot))
+    driven, joints = read_drive(robot), joints_of(robot)
+    apart, sides = driven.wheel_separation_m, driven.sides.items()
+    planes: dict[Usd.Prim, float | None]
+    planes = {joints[n]: apart * (0.5 - side) for n, side in sides if n in joints}
+    define_contacts(robot, planes if len(planes) == 2 else dict.fromkeys(planes))
+    notes += stand_on_floor(robot, driven)
     for noun in ON_ROOT:
         define_on_root(robot, noun, settings.plant.spec if noun == "plant" else getattr(settings, noun))
     define_battery(stage, _free(links, _base(robot), "battery"), settings.battery)

@@ -111,7 +111,7 @@ def wheels_of(robot: Usd.Prim) -> list[Wheel]:
         if not joint or not _range(joint) > FULL_TURN_DEG:
             continue
         bodies = joint.GetBody1Rel().GetTargets()
-        box = _box(robot, prim.GetStage().GetPrimAtPath(bodies[0])) if bodies else None
+        box = solid_box(robot, prim.GetStage().GetPrimAtPath(bodies[0])) if bodies else None
         if box is None or box.IsEmpty():
             continue
         (x, y, z), size = box.GetMidpoint(), box.GetSize()
@@ -162,6 +162,16 @@ def _axles(wheels: list[Wheel]) -> list[tuple[Wheel, Wheel]]:
         if left.y > ALIKE_M
         and max(abs(left.x - right.x), abs(left.y + right.y), abs(left.z - right.z)) < ALIKE_M
     ]
+
+
+def solid_box(robot: Usd.Prim, prim: Usd.Prim) -> Gf.Range3d:
+    """The bounding box of the enabled colliders below a prim, along the robot's axes; without, of all."""
+    box = Gf.Range3d()
+    for each in Usd.PrimRange(prim, Usd.TraverseInstanceProxies()):
+        api = UsdPhysics.CollisionAPI(each)
+        if api and api.GetCollisionEnabledAttr().Get():
+            box.UnionWith(_box(robot, each))
+    return _box(robot, prim) if box.IsEmpty() else box
 
 
 def _box(robot: Usd.Prim, prim: Usd.Prim) -> Gf.Range3d:

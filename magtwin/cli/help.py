@@ -45,7 +45,7 @@ magtwin help look       a group
 magtwin --version, -V
 
 Each command takes --json, --quiet (-q), --debug (the traceback of a refusal),
---allow DIR (stages may name files in that folder too). Options can be set in
+--allow DIR (inputs may name files in that folder too). Options can be set in
 magtwin.toml and in the environment (MAGTWIN_RUN_SEED=1). Exit status: 0 done,
 1 an input was refused, 2 wrong usage."""
 

@@ -29,7 +29,7 @@ def allowed_folders() -> tuple[str, ...]:
 
 @contextmanager
 def allow(*folders: str | os.PathLike[str]) -> Iterator[None]:
-    """In the block, stages may name files in these folders, and below them.
+    """In the block, stages and robot descriptions may name files in these folders, and below them.
 
     A stage may name files of its own folder, and those that ship with magtwin. Any other file is refused,
     since a stage from a stranger could show it, or `export_scene` pack it. Processes that are started in the

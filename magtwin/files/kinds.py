@@ -193,7 +193,8 @@ def stage_in(folder: Path) -> Path:
     A scene NAME is NAME.usda beside NAME_layer.usda; a robot is the only stage of its folder.
     """
     inside = folder / f"{folder.resolve().name}.usda"
-    stages = list(folder.glob("*.usda")) if folder.is_dir() and not inside.is_file() else []
+    named = folder.glob("*.usda") if folder.is_dir() and not inside.is_file() else ()
+    stages = [stage for stage in named if stage.name != "edits.usda"]  # of a robot's user
     whole = [stage for stage in stages if stage.with_name(f"{stage.stem}_layer.usda").is_file()] or stages
     return whole[0] if len(whole) == 1 else inside
 

@@ -19,7 +19,15 @@ from magtwin.spec.drive import DriveSpec
 from magtwin.urdf.description.description import Description, origin_of, read_description
 from magtwin.urdf.description.extensions import MODULES
 from magtwin.urdf.description.tag import Tags
-from magtwin.urdf.layout import GEOMETRIES, PAYLOADS, check_payloads, write_layers
+from magtwin.urdf.layout import (
+    EDITS,
+    GEOMETRIES,
+    PAYLOADS,
+    check_payloads,
+    keep_edits,
+    lost_edits,
+    write_layers,
+)
 from magtwin.urdf.material import LOOKS
 from magtwin.urdf.meshes.mesh_layer import MeshLayer, free_name, gather
 from magtwin.urdf.meshes.texture import TEXTURES
@@ -130,7 +138,8 @@ def _write_payloads(author: "_Author", out: Path, force: bool) -> ConversionRepo
         stage, report = author.stage(aside, f"./{PAYLOADS}/{GEOMETRIES}")
         if author.meshes.textures:
             author.meshes.textures.export(work / TEXTURES)
-        write_layers(stage.GetRootLayer(), aside, work, out)
+        write_layers(stage.GetRootLayer(), aside, work, out, edits=True)
+        keep_edits(out.parent, stage.GetDefaultPrim().GetName())
         shutil.move(work, aside_folder)
     return report
 
@@ -171,14 +180,23 @@ class _Author:
     finish: Finish | None
     ledger: Ledger = field(default_factory=Ledger)
 
+    def __post_init__(self) -> None:
+        self.tags = Tags(self.description)
+
     def stage(self, aside: Path, layer: str) -> tuple[Usd.Stage, ConversionReport]:
         """Author the robot in one layer at `aside`, and compare it with its description."""
         stage, description, options = Usd.Stage.CreateNew(str(aside)), self.description, self.options
         robot = self._robot(stage, layer)
         for note in self.finish(robot) if self.finish else ():
             description.note(note)
+        for path in () if options.single_file else lost_edits(self.out.parent, stage):
+            description.note(f"{EDITS} edits <{path}>, which this conversion does not have", lost=True)
         checksum = sha256(description.path)
         report = make_report(description, stage, self.ledger, name=self.out.name, sha256=checksum)
+        if options.proof:
+            report = replace(
+                report, proof=import_module(MODULES["proof"]).make_proof(self.tags, stage, self.ledger)
+            )
         description.repairs.check(report.source, strict=options.strict)
         notes = Vt.StringArray(description.repairs.notes)
         stage.GetRootLayer().customLayerData = {
@@ -200,21 +218,20 @@ class _Author:
         if names[""] != description.name:
             description.note(f"{description.name!r} is called {names['']!r} in USD")
         names |= _free_names(description.links, {JOINTS, LOOKS, VISUALS, COLLISIONS}, "", description)
-        mechanism, tags = read_mechanism(description, self.options), Tags(description)
+        mechanism, tags = read_mechanism(description, self.options), self.tags
         check_rules(mechanism, self.options)
-        base, commands = read_base(tags, self.options.controllers), read_commands(tags, mechanism)
+        base = read_base(tags, self.options.controllers)
         surfaces = read_surfaces(tags)
         driven: tuple[str, ...] = ()
         if self.options.profile == "diff-drive":
             base = find_base(mechanism, base)
             driven = base.wheels
             surfaces = grip(mechanism, driven, surfaces)
-            commands = not_on(driven, commands)
         places = place_links(mechanism, merge=self.options.merge_fixed)
         fixed = self.options.fix_base or (
             base is None and self.options.profile == "general" and mechanism.in_world(_base(places))
         )
-        options = replace(self.options, drives=(*self.options.drives, *commands), fix_base=fixed)
+        options = replace(self.options, fix_base=fixed)
         poses = mechanism.poses()
         robot = _define(stage, Sdf.Path.absoluteRootPath.AppendChild(names[""]), description.name)
         stage.SetDefaultPrim(robot)
@@ -231,10 +248,13 @@ class _Author:
                 for visual in carried(link.visuals, pose, part, name):
                     rider.visuals.append(define_visual(body, visual, description, self.meshes, layer))
                     ledger.visuals.add(rider.visuals[-1].GetPath())
+                    ledger.show(visual, rider.visuals[-1])
                 for collision in carried(link.collisions, pose, part, name):
                     rider.colliders.append(define_collider(body, collision, surface, self.meshes, layer))
+                    ledger.show(collision, rider.colliders[-1])
                 parts.append(rider)
-            define_body(body, parts, description)
+            filled = define_body(body, parts, description, options.density)
+            mechanism.filled.update({part: solid.moved(poses[name]) for part, solid in filled.items()})
             colliders[name] = [collider for part in parts for collider in part.colliders]
             if not colliders[name]:
                 define_no_contact(body, surfaces.get(name, Surface()), self.meshes)
@@ -245,8 +265,15 @@ class _Author:
                 frame.AddAppliedSchema(SITE_API)
                 became = "frame" if is_marker(description.links[name]) else "merged"
                 ledger.bodies[name] = became, frame.GetPath()
+        drive = self._drive(base, mechanism, bodies, tags)
         wheels = fit_wheels(mechanism, driven, bodies) if driven else NO_WHEELS
+        commands = not_on(driven, read_commands(tags, mechanism))
+        options = replace(options, drives=(*options.drives, *commands))
         joints = self._joints(stage, mechanism, options, wheels, places, paths)
+        planes = _planes(drive, base, mechanism)
+        if planes:
+            wheeled = {stage.GetPrimAtPath(ledger.joints[n]): y for n, y in planes.items()}
+            import_module(MODULES["drive"]).define_contacts(robot, wheeled)
         robot.AddAppliedSchema(ROBOT_API)
         jointed = [stage.GetPrimAtPath(joint) for joint in joints]
         held = any(robot.GetPath() in UsdPhysics.Joint(joint).GetBody0Rel().GetTargets() for joint in jointed)
@@ -258,7 +285,7 @@ class _Author:
             relationship = robot.CreateRelationship(f"isaac:physics:{name}", custom=False)
             for path in paths_listed:  # each is prepended, so that a stronger layer can add to the list
                 relationship.AddTarget(path)
-        self._equip(robot, tags, options, self._drive(base, mechanism, bodies, tags), held)
+        self._equip(robot, tags, options, drive, held)
         return robot
 
     def _drive(
@@ -360,6 +387,19 @@ class _Author:
         if count:
             most = ", ".join(sorted(ledger.unknown_tags, key=lambda tag: -ledger.unknown_tags[tag])[:4])
             tags.description.note(f"{count} tags without a meaning here are kept as text, such as {most}")
+
+
+def _planes(
+    drive: DriveSpec | None, base: MobileBase | None, mechanism: Mechanism
+) -> dict[str, float | None]:
+    """Y of the plane in which each wheel of a drive touches the floor [m]; None for that of its joint."""
+    if drive is None or base is None:
+        return {}
+    joints = mechanism.description.joints.values()
+    held = {joint.child for joint in joints if joint.name in base.steered}
+    planes = {joint.name: None for joint in joints if joint.parent in held and joint.type == "continuous"}
+    exact, half = base.kind in ("differential", "car"), drive.wheel_separation_m / 2  # else an effective one
+    return planes | {name: half * (1 - 2 * side) if exact else None for name, side in drive.sides.items()}
 
 
 def _base(places: dict[str, Place]) -> str:

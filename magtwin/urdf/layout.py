@@ -1,6 +1,7 @@
 """Layout: split one authored layer into the layers of Isaac Sim's asset structure 3.0.
 
     robot.usda                      interface: references base, variant set Physics
+    edits.usda                      the user's changes; a sublayer of the interface, and never written again
     payloads/base.usda              links, frames and sensors with their poses and looks
     payloads/instances.usda         visuals and colliders of each link
     payloads/geometries.usdc        triangles
@@ -19,10 +20,11 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-from pxr import Sdf, UsdUtils
+from pxr import Sdf, Usd, UsdUtils
 
 from magtwin.errors import InputError
-from magtwin.files.outputs import check_free
+from magtwin.files.file import read_bytes
+from magtwin.files.outputs import check_free, output
 from magtwin.urdf.material import LOOKS
 from magtwin.urdf.shape import COLLISIONS, VISUALS
 from magtwin.usd.layers import open_layer
@@ -32,6 +34,9 @@ PAYLOADS = "payloads"
 """Folder of the layers beside the interface."""
 
 GEOMETRIES = "geometries.usdc"
+
+EDITS = "edits.usda"
+"""Layer of the user's changes, which a new conversion keeps."""
 
 VARIANT_SET = "Physics"
 
@@ -83,6 +88,9 @@ NAMESPACES = (
 )
 """Layer of a property by the start of its name."""
 
+PLACED = ("specifier", "typeName", "apiSchemas", "variantSetNames", "variantSelection", "primOrder")
+"""Metadata of a prim that are authored apart from the others."""
+
 LONG = 64
 """Longest array in a layer of text; usd-validation-nvidia refuses longer ones."""
 
@@ -108,7 +116,43 @@ def check_payloads(out: Path, *, force: bool) -> Path:
     return check_free(folder, force=force)
 
 
-def write_layers(flat: Sdf.Layer, out: Path, folder: Path, final: Path) -> None:
+NO_EDITS = """#usda 1.0
+(
+    defaultPrim = "{robot}"
+    doc = "{robot}: your changes. A new conversion keeps this file."
+)
+
+over "{robot}"
+{{
+}}
+"""
+
+
+def keep_edits(folder: Path, robot: str) -> None:
+    """Write an empty layer for the user's changes to the prim `robot`, unless the folder has one."""
+    if not (folder / EDITS).exists():
+        with output(folder / EDITS) as aside:
+            aside.write_text(NO_EDITS.format(robot=robot), encoding="utf-8")
+
+
+def lost_edits(folder: Path, stage: Usd.Stage) -> list[str]:
+    """Paths of the outermost prims that the user's changes in a folder edit and a stage does not have."""
+    empty = NO_EDITS.format(robot=stage.GetDefaultPrim().GetName()).encode()
+    if not (folder / EDITS).is_file() or read_bytes(folder / EDITS, "layer", "USD text") == empty:
+        return []
+    lost: list[Sdf.Path] = []
+    layer = open_layer(folder / EDITS)
+
+    def visit(path: Sdf.Path) -> None:
+        over = path.IsPrimPath() and layer.GetPrimAtPath(path).specifier == Sdf.SpecifierOver
+        if over and not stage.GetPrimAtPath(path):
+            lost.append(path)
+
+    layer.Traverse(Sdf.Path.absoluteRootPath, visit)
+    return [str(path) for path in sorted(lost) if path.GetParentPath() not in lost]
+
+
+def write_layers(flat: Sdf.Layer, out: Path, folder: Path, final: Path, *, edits: bool = False) -> None:
     """Write an authored layer as an asset of layers.
 
     Args:
@@ -116,8 +160,11 @@ def write_layers(flat: Sdf.Layer, out: Path, folder: Path, final: Path) -> None:
         out: Interface layer to write.
         folder: Folder for the other layers; contains the geometries already.
         final: Final path of `out`, beside PAYLOADS.
+        edits: Whether EDITS lies beside it.
     """
     parts = split(flat)
+    if edits:
+        parts["interface"].subLayerPaths.append(f"./{EDITS}")
     for name, layer in parts.items():
         path = out if name == "interface" else folder / FILES[name]
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -135,6 +182,12 @@ def split(flat: Sdf.Layer) -> dict[str, Sdf.Layer]:
     parts = {name: Sdf.Layer.CreateAnonymous(f"{name}.usda") for name in ("interface", *FILES)}
     with Sdf.ChangeBlock():
         _Splitter(flat, parts).route(robot)
+    for name in [variants.name for variants in robot.variantSets]:  # of contacts
+        home = _prim(parts["physics"], robot.path)
+        home.variantSetNameList.prependedItems.append(name)
+        home.variantSelections[name] = robot.variantSelections[name]
+        variants = robot.path.AppendVariantSelection(name, "")
+        Sdf.CopySpec(flat, variants, parts["physics"], variants)
     if not parts["arrays"].rootPrims:
         del parts["arrays"]
     for name, layer in parts.items():
@@ -158,7 +211,7 @@ class _Splitter:
         if spec.typeName:
             home.typeName = spec.typeName
         for key in spec.ListInfoKeys():
-            if key not in ("specifier", "typeName", "apiSchemas"):
+            if key not in PLACED:
                 home.SetInfo(key, spec.GetInfo(key))
         if owner == "instances" and spec.name in SHAPES:
             scope = _prim(self.parts["instances"], INSTANCES)
@@ -295,7 +348,7 @@ def _compose(parts: dict[str, Sdf.Layer], robot: Sdf.PrimSpec) -> None:
 
 def _moved(here: Path, final: Path, home: Path) -> Callable[[str], str]:
     """A function that converts asset paths from the temporary folder `here` to the final layer `home`."""
-    own = {f"./{path}" for path in FILES.values()} | {"./physics.usda"}
+    own = {f"./{path}" for path in FILES.values()} | {"./physics.usda", f"./{EDITS}"}
     own |= {f"./{PAYLOADS}/{path}" for path in (*VARIANTS.values(), FILES["base"]) if path}
 
     def seen(path: str) -> str:

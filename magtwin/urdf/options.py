@@ -95,6 +95,9 @@ class Options:
     single_file: bool = False
     """Whether to write one root layer and the meshes, instead of Isaac Sim's layers."""
 
+    density: float = 1000.0
+    """Density of links without `<inertial>`, see `physics.link` [kg/m3]."""
+
     strict: bool = False
     """Whether to refuse a description with faults, which are repaired otherwise."""
 
@@ -102,8 +105,15 @@ class Options:
     """Whether to skip files and packages that a xacro includes, if they are missing and none of their macros
     is called."""
 
+    proof: bool = False
+    """Whether the report lists what became of each element and attribute."""
+
     metadata: Mapping[str, str] = field(default_factory=dict)
     """Metadata of the asset (author, asset_license, category, ...); overrides that of its package."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.density < math.inf:
+            raise InputError(f"density must be above 0 kg/m3, got {self.density!r}", parameter="density")
 
 
 DEFAULTS = Options()

@@ -6,6 +6,7 @@ one `Repairs`, and `check` decides what `Options.strict` refuses.
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from xml.etree.ElementTree import Element
 
 from magtwin.errors import InputError, find
 
@@ -71,7 +72,7 @@ FAULTS: Mapping[str, tuple[str, str]] = {
     "mesh-missing": ("missing mesh", "a box of the link's size as a placeholder"),
     "mesh-unreadable": ("mesh that cannot be read", "a box of the link's size as a placeholder"),
     "mesh-flat": ("flat collision mesh", "thickened to a thin plate"),
-    "file-name": ("package path with odd slashes, or path relative to the package", "read as meant"),
+    "file-name": ("path with odd slashes, or of a file that lies elsewhere", "read as meant"),
     "package-missing": ("missing package of $(find)", "files in it count as missing"),
     "include-renamed": (
         "missing include with the suffix .xacro or .urdf.xacro, beside a file with the other",
@@ -113,6 +114,9 @@ class Repairs:
 
     supplies: dict[str, None] = field(default_factory=dict)
     """Options of the command line that would supply what is missing, such as `--package arm=FOLDER`."""
+
+    about: dict[Element, list[tuple[str, str]]] = field(default_factory=dict)
+    """Kinds and texts of repairs by the element with the fault."""
 
     suggested: int = 0
     """Names so far for which a near one was looked for."""

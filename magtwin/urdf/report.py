@@ -1,6 +1,8 @@
 """Report: every link and joint of a conversion, in the description and on the stage."""
 
+import csv
 import dataclasses
+import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,7 +11,8 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdPhysics
 
 from magtwin.report.report import Figure, Report
-from magtwin.urdf.description.description import Description
+from magtwin.urdf.description.description import Description, Element
+from magtwin.urdf.description.model import Shape
 from magtwin.urdf.repairs import FAULTS, UNKNOWN, Repair
 from magtwin.usd.geometry import read_vertices
 
@@ -18,6 +21,10 @@ Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 HUGE_M = 30.0
 """Size of a robot above which its meshes are probably in millimetres [m]."""
+
+FATES = ("used", "text", "repaired", "lost")
+"""Every element and attribute has one: a prim carries it; it is kept as text; a repair changed it or left it
+out; nothing carries it."""
 
 PLACES, LINES = 3, 8
 """Most places of one kind of fault, and most guesses, that the terminal shows."""
@@ -70,6 +77,24 @@ class RepairLine:
 
 
 @dataclass(frozen=True)
+class ProofLine:
+    """An element, or an attribute of one."""
+
+    place: str
+    """`file:line`."""
+    item: str
+    """Path of elements, with `@attribute` at its end if it is one."""
+    value: str
+    """Value of the attribute."""
+    fate: str
+    """See `FATES`."""
+    prim: str
+    """Prim that carries it."""
+    carried: str
+    """Property and value of the prim, the repair, or the reason why nothing carries it."""
+
+
+@dataclass(frozen=True)
 class ConversionReport:
     """What a conversion read, wrote and changed."""
 
@@ -95,10 +120,20 @@ class ConversionReport:
     """Contents of the description that the stage lacks, one line each."""
     unknown_tags: Mapping[str, int] = field(default_factory=dict)
     """Number of occurrences of each tag, and attribute as `@name`, that is known and kept as text."""
+    proof: tuple[ProofLine, ...] = ()
+    """What became of each element and attribute, with `Options.proof`."""
 
     def to_json(self) -> str:
         """The report as one JSON object."""
         return json.dumps(dataclasses.asdict(self), indent=2) + "\n"
+
+    def proof_table(self) -> str:
+        """The proof as CSV."""
+        text = io.StringIO()
+        rows = csv.writer(text, lineterminator="\n")
+        rows.writerow([field.name for field in dataclasses.fields(ProofLine)])
+        rows.writerows(map(dataclasses.astuple, self.proof))
+        return text.getvalue()
 
     def summary(self) -> Report:
         """The report in figures, for a terminal."""
@@ -122,6 +157,9 @@ class ConversionReport:
             Figure("tags and attributes without a use", sum(self.unknown_tags.values()), note="kept as text"),
             Figure("guesses", len(guesses)),
         ]
+        if self.proof:
+            counted = ", ".join(f"{sum(line.fate == fate for line in self.proof)} {fate}" for fate in FATES)
+            figures.append(Figure("elements and attributes", len(self.proof), note=counted))
         metadata: dict[str, str | list[str]] = {
             "source": self.source,
             "sha256": self.source_sha256,
@@ -154,8 +192,16 @@ class Ledger:
 
     visuals: set[Sdf.Path] = field(default_factory=set)
 
+    shapes: dict[Element, Sdf.Path] = field(default_factory=dict)
+    """Prim by the checked element of a visual or collision."""
+
     unknown_tags: dict[str, int] = field(default_factory=dict)
     """Number of occurrences of each known tag or attribute without a meaning here."""
+
+    def show(self, shape: Shape, prim: Usd.Prim) -> None:
+        """Keep the prim of a visual or collision."""
+        if shape.element is not None:
+            self.shapes[shape.element] = prim.GetPath()
 
 
 def make_report(

@@ -27,6 +27,7 @@ from magtwin.report.report import Figure, Report
 from magtwin.urdf.description.model import rpy_of
 from magtwin.urdf.meshes.mesh_layer import MESH, free_name, primitive_of
 from magtwin.urdf.meshes.scan import STL
+from magtwin.urdf.physics.contact import CONTACT, DESCRIBED
 from magtwin.urdf.physics.joint import AXIS
 from magtwin.urdf.physics.link import SITE_API
 from magtwin.urdf.physics.mechanism import displacement
@@ -115,6 +116,11 @@ def write_urdf(asset: str | os.PathLike[str], out: str | os.PathLike[str], *, fo
         seen = ", ".join(str(prim.GetPath()) for prim in roots) or "none"
         raise InputError(f"{asset}: a URDF has one articulation, found {seen}; give the robot's own asset")
     robot = roots[0].GetParent() if roots[0].HasAPI(UsdPhysics.RigidBodyAPI) else roots[0]
+    if robot.GetVariantSets().HasVariantSet(CONTACT):
+        path = robot.GetPath()
+        with Usd.EditContext(stage, stage.GetSessionLayer()):
+            robot.GetVariantSet(CONTACT).SetVariantSelection(DESCRIBED)
+        robot = stage.GetPrimAtPath(path)
     writer = _Writer(stage, robot, folder.name)
     xml = writer.write()
     ElementTree.indent(xml)

@@ -234,11 +234,6 @@ BOMBS = {
     "commas.csv": (commas, read_run, "that decode to 112.0 MB"),
     "columns.csv": (lambda p: p.write_text("t" + ",a" * 20_000 + "\n"), read_run, "over 10,000 columns"),
     "facts.csv": (lambda p: p.write_text("# facts " + "[" * 99_999 + "\nt\n0\n"), read_run, "metadata"),
-    "comments.csv": (
-        lambda p: p.write_text("#a\n" * 200_000 + "t\n0\n"),
-        read_run,
-        "100,000 lines of comments",
-    ),
     "column.csv": (lambda p: p.write_text("# column t " + "[" * 99_999 + "\nt\n0\n"), read_run, "not JSON"),
     "images.mcap": (mcap, read_messages, "that decode to"),
     "endless.db3": (lambda p: db3(p, f"CREATE VIEW metadata AS {ENDLESS}"), read_run, "metadata is computed"),

@@ -112,7 +112,7 @@ def test_the_files_are_those_of_isaac_sims_structure(tmp_path):
     names = ("base.usda", "geometries.usdc", "instances.usda", "materials.usda", "robot.usda")
     physics = ("mujoco.usda", "physics.usda", "physx.usda")
     wanted = [f"payloads/{n}" for n in names] + [f"payloads/Physics/{n}" for n in physics]
-    assert files == sorted(["arm.usda", *wanted])
+    assert files == sorted(["arm.usda", "edits.usda", *wanted])
     layer = Sdf.Layer.FindOrOpen(str(out))  # held in a name: a spec does not keep its layer alive
     interface = layer.GetPrimAtPath("/arm")
     assert [r.assetPath for r in interface.referenceList.prependedItems] == ["./payloads/base.usda"]

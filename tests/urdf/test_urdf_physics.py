@@ -402,7 +402,7 @@ def test_diff_drive_drives_the_wheels_frees_the_casters_and_welds_the_dead_suspe
     for name in ("left", "right"):
         drive, stiffness, damping = drive_of(robot, name)
         assert stiffness == 0
-        assert_allclose(damping, kg * radius**2 / n / 0.007, rtol=5e-3)  # three figures
+        assert_allclose(damping, 5 * kg * radius**2 / n / 0.007, rtol=5e-3)  # three figures
         assert_allclose(drive.GetMaxForceAttr().Get(), kg * 9.81 * radius / n, rtol=5e-3)
         limit = prim(robot, name).GetAttribute("newton:velocityLimit").Get()
         assert_allclose(limit, np.degrees(30), rtol=1e-6)

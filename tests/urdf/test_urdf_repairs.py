@@ -218,8 +218,8 @@ FAULTY = {
     ],
     "mesh-flat": [(meshed("flat.stl", "collision"), 2, "as a plate 0.0071 m")],
     "file-name": [
-        (meshed("parts/box.stl"), 2, "is found in the package, not beside"),
-        (meshed("package:///arms/flat.stl"), 2, "'package://arms/"),
+        (meshed("parts/box.stl"), 2, "'parts/box.stl' is read as '"),
+        (meshed("package:///arms/flat.stl"), 2, "is read as '"),
     ],
     "drive-incomplete": [
         (wheels(left="jj", right="j"), 9, "<left_joint>: no joint 'jj'; did you mean 'j'"),
@@ -350,7 +350,8 @@ def test_packages_of_ros_are_found_by_the_name_in_the_description_and_only_so(tm
 
 
 def test_a_folder_of_meshes_beside_a_folder_urdf_is_read_and_nothing_else_there(tmp_path):
-    for folder in ("urdf", "meshes", "secret"):
+    (tmp_path / "urdf").mkdir()
+    for folder in ("meshes", "secret"):
         (tmp_path / folder).mkdir()
         trimesh.creation.box().export(tmp_path / folder / "a.stl")
     path = tmp_path / "urdf" / "arm.urdf"

@@ -4,6 +4,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from made import BALL, INERTIAL, converted
 from numpy.testing import assert_allclose
 from pxr import UsdGeom, UsdPhysics
@@ -136,3 +138,60 @@ def test_dont_collapse_keeps_a_body_when_fixed_joints_are_merged(tmp_path, word,
     )
     assert {p.GetName() for p in stage.Traverse() if p.HasAPI(UsdPhysics.RigidBodyAPI)} == bodies
     assert report.mass_out_kg == report.mass_in_kg
+
+
+PLACES = [e for e in ElementTree.fromstring(FULL).iter() if e.tag != "texture"]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, len(PLACES) - 1), st.from_regex(r"[a-z]{3,9}_x", fullmatch=True), st.floats(-9, 9))
+def test_an_unknown_attribute_anywhere_is_always_reported(tmp_path_factory, at, name, value):
+    robot = ElementTree.fromstring(FULL)
+    [e for e in robot.iter() if e.tag != "texture"][at].set(name, f"{value:g}")
+    path = tmp_path_factory.mktemp("unknown") / "robot.urdf"
+    path.write_text(ElementTree.tostring(robot, encoding="unicode"))
+    repairs = read_description(path).repairs.by_kind()["attribute-unknown"]
+    assert [r.text for r in repairs if f"{name}='{value:g}'" in r.text]
+    assert all(r.line for r in repairs)
+
+
+def test_the_proof_has_a_line_for_each_element_and_attribute(tmp_path):
+    shapes = f"<visual>{BALL}</visual><collision>{BALL}</collision>"
+    text = arm('type="revolute"', shapes, LIMIT.format('acceleration="3"') + '<axis xyz="0 0 1"/>').replace(
+        "</robot>", '<material name="spare"><color rgba="1 0 0 1"/></material></robot>'
+    )
+    stage, report = convert(tmp_path, text, proof=True)
+    xml = ElementTree.fromstring(text)
+    assert len(report.proof) == sum(1 + len(e.attrib) for e in xml.iter())
+    lines = {line.item.split("/", 1)[-1]: line for line in report.proof}
+    joint = "/arm/joints/j"
+    for item, fate, prim, carried in (
+        ("link(base)/inertial/mass/@value", "used", "/arm/base", "physics:mass = 1.0"),
+        ("link(base)/collision/geometry/sphere/@radius", "used", "/arm/base/collisions/sphere", "radius ="),
+        ("joint(j)/axis/@xyz", "used", joint, "physics:axis = Z"),
+        ("joint(j)/limit/@lower", "used", joint, "physics:lowerLimit = -57.29578"),
+        ("joint(j)/limit/@acceleration", "text", joint, KEPT),
+        ("material(spare)/color/@rgba", "lost", "", "no visual wears it"),
+    ):
+        assert (lines[item].fate, lines[item].prim, lines[item].carried[: len(carried)]) == (
+            fate,
+            prim,
+            carried,
+        )
+    for line in report.proof:
+        assert line.fate != "used" or stage.GetPrimAtPath(line.prim)
+
+
+@pytest.mark.parametrize(("density", "kg"), [(1000.0, 4.0), (250.0, 1.0)])
+def test_a_robot_without_inertials_weighs_what_its_shapes_do(tmp_path, density, kg):
+    box = '<geometry><box size=".2 .2 .1"/></geometry>'
+    joint = '<joint name="j" type="continuous"><parent link="base"/><child link="tip"/></joint>'
+    text = (
+        f'<robot name="bare"><link name="base"><collision>{box}</collision></link>'
+        f'<link name="tip"><visual>{box}</visual></link>{joint}</robot>'
+    )
+    _, report = convert(tmp_path, text, density=density)
+    assert [line.mass_out_kg for line in report.links] == [pytest.approx(kg), pytest.approx(kg)]
+    assert sum("has no <inertial>" in note for note in report.notes) == 2
+    with pytest.raises(InputError, match="density must be above 0"):
+        convert(tmp_path, text, density=0.0)

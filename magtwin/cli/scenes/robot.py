@@ -1,6 +1,6 @@
 """`magtwin robot`: a description in, a USD articulation out, and back."""
 
-from contextlib import nullcontext
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Literal
 
@@ -24,10 +24,12 @@ def robot(
     controllers: Path | None = None,
     fix_base: bool | None = None,
     merge_fixed: bool | None = None,
+    density: float | None = None,
     single_file: bool | None = None,
     strict: bool | None = None,
     thumbnail: Flag = False,
     report: Path | None = None,
+    proof: Path | None = None,
     force: Force = False,
 ) -> Done:
     """Convert a URDF or xacro to a USD articulation that drives, or such a stage to a URDF.
@@ -59,6 +61,8 @@ def robot(
         Fix the base to the world.
     merge_fixed
         Merge links on fixed joints into the body that carries them; their frames stay.
+    density
+        Density of links whose mass the description does not give [kg/m3]. Default: 1000.
     single_file
         Write one root layer and its meshes, in place of Isaac Sim's layers.
     strict
@@ -67,6 +71,8 @@ def robot(
         Draw a picture of the robot beside it, which NVIDIA's SimReady profiles require.
     report
         Full report to write (.json).
+    proof
+        Table to write (.csv): each element and attribute with the prim and value that carries it, or "lost".
     """
     given = dict(locals())
     from magtwin.files.outputs import output, transaction
@@ -90,22 +96,27 @@ def robot(
 
     if report is not None:
         report = named(report, (".json",), "a report", force=force)
+    if proof is not None:
+        proof = named(proof, (".csv",), "a proof", force=force)
     if out.suffix.lower() == ".usda" and single_file is None:
         note(f"{out} is one file, with its meshes beside it; --out {out.stem} makes a folder of layers")
-    same = ("skip_missing_includes", "profile", "fix_base", "merge_fixed", "single_file", "strict")
+    same = ("skip_missing_includes", "profile", "fix_base", "merge_fixed", "density", "single_file", "strict")
     choices = {name: given[name] for name in same} | {
         "packages": {name: Path(folder) for name, folder in pairs("package", package).items()} or None,
         "arguments": pairs("arg", arg, empty=True) or None,
         "drives": tuple(DriveRule.parse(text) for text in drive or ()) or None,
         "controllers": controllers,
+        "proof": True if proof is not None else None,
     }
     step("Converting the robot")
-    with transaction(), output(report, force=force) if report is not None else nullcontext() as aside:
+    with transaction(), ExitStack() as files:
+        asides = {f: files.enter_context(output(f, force=force)) for f in (report, proof) if f is not None}
         chosen = {name: choice for name, choice in choices.items() if choice is not None}
         picture = _thumbnail if thumbnail else None
         made = from_urdf(urdf, out, settings=settings, force=force, thumbnail=picture, **chosen)
-        if aside is not None:
-            aside.write_text(made.report.to_json(), encoding="utf-8")
+        for file, aside in asides.items():
+            text = made.report.to_json() if file == report else made.report.proof_table()
+            aside.write_text(text, encoding="utf-8")
     summary = made.report.summary()
     following = (("magtwin", "plot", made.asset), ("magtwin", "validate", made.asset))
     return Done(summary, made.asset, rest=f"magtwin info {made.asset}", next=following)

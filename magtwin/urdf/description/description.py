@@ -5,7 +5,6 @@ the XML.
 """
 
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -35,10 +34,8 @@ from magtwin.urdf.source.source import Source, read_source
 
 Element = ElementTree.Element
 
-_SCHEME = re.compile(r"^(package|model):/*")
-
-_NAMELESS = re.compile(r"^(package|model):///")
-"""A path without a package, such as `package:///meshes/arm.stl`."""
+WORLD = "world"
+"""Root link that is the world."""
 
 JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic", "planar", "floating")
 """Types of joints that can be converted."""
@@ -75,6 +72,9 @@ class Description:
     repairs: Repairs = field(default_factory=Repairs)
     """Every repair, loss and guess of a conversion."""
 
+    checked: dict[Element, Element] = field(default_factory=dict)
+    """What became of each element of links, joints and materials that is used."""
+
     @cached_property
     def joint_names(self) -> frozenset[str]:
         """Names of all joints."""
@@ -95,29 +95,11 @@ class Description:
         return self.source.where(element)
 
     def find_file(self, filename: str, what: str) -> Path:
-        """The file that a `filename=` refers to, see `Source.find_file`.
-
-        Backslashes, too many or too few slashes after a scheme, and names relative to the package are
-        repaired. A path that names no package, with three slashes, may lead to a file beside the description.
-        """
-        element = self.source.elements.get(("", filename))
-        name = filename.replace("\\", "/")
-        usual = _SCHEME.sub(r"\1://", name)
-        rest = usual.partition("://")[2]
-        is_beside = "/" not in rest or os.path.isfile(self.path.parent / rest)  # noqa: PTH113, which may raise
-        if _NAMELESS.match(name) and is_beside:
-            usual = rest
-        if usual != filename:
-            self.repair("file-name", f"{what} {filename!r} is read as {usual!r}", element)
+        """The file that a `filename=` refers to, see `Source.find_file`."""
         try:
-            path = self.source.find_file(usual, what, element)
+            return self.source.find_file(filename, what, self.source.elements.get(("", filename)))
         finally:
             self._take_notes()
-        if ":" not in usual and not (self.path.parent / usual).is_file():
-            self.repair(
-                "file-name", f"{what} {filename!r} is found in the package, not beside the file", element
-            )
-        return path
 
     def mesh_element(self, filename: str) -> Element | None:
         """The first `<mesh>` of a file."""
@@ -144,6 +126,8 @@ class Description:
         """
         element = self._find(*about) if isinstance(about, tuple) else about
         self.repairs.add(kind, text, self.source.place(element))
+        if element is not None:
+            self.repairs.about.setdefault(element, []).append((kind, text))
 
     def refused(self, kind: str, name: str, text: str) -> InputError:
         """An error with the line of the link or joint called `name`."""
@@ -188,7 +172,9 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
     check_names(source, description.repair)
     description = replace(description, name=source.xml.attrib["name"])
     clean = [
-        check_grammar(part, description.where, description.repair) for part in source.xml if part.tag in PARTS
+        check_grammar(part, description.where, description.repair, description.checked)
+        for part in source.xml
+        if part.tag in PARTS
     ]
     _report_unknown(description)
     links = [read_link(e) for e in clean if e.tag == "link"]
@@ -198,6 +184,10 @@ def read_description(source: Source | str | os.PathLike[str]) -> Description:
                 text = f"link {link.name!r}: a {role} {kind} of size 0 is left out"
                 description.repair("shape-empty", text, ("link", link.name))
     joints = _leading(description, links, [read_joint(e) for e in clean if e.tag == "joint"])
+    parents = {joint.parent for joint in joints} - {link.name for link in links}
+    if WORLD in parents:
+        description.note(f"link {WORLD!r} is held by a joint and missing: it is added")
+        links.append(Link(WORLD, None, (), ()))
     materials = _materials(description, [e for e in clean if e.tag == "material"])
     held = {joint.child: joint for joint in joints}
     description = replace(

@@ -10,8 +10,10 @@ from dataclasses import dataclass
 MODULES: Mapping[str, str] = {
     "plugin": "magtwin.urdf.physics.controller",
     "sensor": "magtwin.urdf.equipment",
+    "drive": "magtwin.urdf.physics.contact",
+    "proof": "magtwin.urdf.proof",
 }
-"""Module that reads a tag below `<gazebo>`, loaded for a description that has one."""
+"""Module that reads a tag below `<gazebo>`, or that a drive or a proof needs; loaded only then."""
 
 
 @dataclass(frozen=True)

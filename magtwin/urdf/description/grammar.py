@@ -30,13 +30,16 @@ LARGEST = 1e30
 """Larger numbers count as infinite: USD stores single precision, and volumes are cubes."""
 
 
-def check_grammar(part: Element, where: Callable[[Element], str], repair: Repair) -> Element:
+def check_grammar(
+    part: Element, where: Callable[[Element], str], repair: Repair, made: dict[Element, Element] | None = None
+) -> Element:
     """Check a link, joint or material, and repair what has an evident reading.
 
     Args:
         part: The element.
         where: File and line of an element, for error messages.
         repair: Receives every repair.
+        made: Receives what became of each element that is used.
 
     Returns:
         `part` with known elements and attributes only, and numbers separated by blanks.
@@ -45,7 +48,8 @@ def check_grammar(part: Element, where: Callable[[Element], str], repair: Repair
         InputError: A number of a pose, an axis or a size is invalid, so that the shape of the robot is
             unknown.
     """
-    clean = _Checker(f"{part.tag} {part.get('name')!r}", where, repair).cleaned(part)
+    label = f"{part.tag} {part.get('name')!r}"
+    clean = _Checker(label, where, repair, {} if made is None else made).cleaned(part)
     assert clean is not None  # only the elements below it can be left out
     return clean
 
@@ -57,6 +61,7 @@ class _Checker:
     label: str
     where: Callable[[Element], str]
     report: Repair
+    made: dict[Element, Element]
 
     def repair(self, kind: str, text: str, element: Element) -> None:
         self.report(kind, f"{self.label}: {text}", element)
@@ -86,6 +91,7 @@ class _Checker:
         finish = {"link": self._finish_link, "joint": self._finish_joint, "origin": self._finish_origin}
         if element.tag in finish:
             finish[element.tag](clean, element)
+        self.made[element] = clean
         return clean
 
     def _append(self, clean: Element, child: Element) -> None:

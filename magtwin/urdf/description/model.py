@@ -80,6 +80,7 @@ class Shape:
     origin: Array | None = None
     """Pose in the link, shape (4, 4)."""
     material: Material | None = None
+    element: Element | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True)
@@ -215,6 +216,7 @@ def _shape(element: Element) -> Shape:
         name=element.get("name"),
         origin=read_origin(element.find("origin")),
         material=None if material is None else read_material(material),
+        element=element,
     )
 
 

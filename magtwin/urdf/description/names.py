@@ -1,5 +1,6 @@
 """Names: every robot, link and joint has a name of its own."""
 
+import re
 from collections.abc import Callable
 from xml.etree import ElementTree
 
@@ -43,7 +44,10 @@ def check_names(source: Source, repair: Callable[[str, str, Element], None]) -> 
             repair("name-twice", f"{text}: the second is equal and left out", element)
             xml.remove(element)
     if not xml.findall("link"):
-        raise InputError(f"{where(xml)}: the robot has no <link>")
+        text = source.path.read_text(encoding="utf-8", errors="replace")
+        macros = ", ".join(re.findall(r"<xacro:macro[^>]*?\bname=[\"']([^\"']+)", text))
+        advice = f"; it has macros only: {macros}; convert a file that calls one" if macros else ""
+        raise InputError(f"{where(xml)}: the robot has no <link>{advice}")
     for joint in xml.findall("joint"):
         for end in ("parent", "child"):
             named = joint.find(end)

@@ -32,6 +32,8 @@ class Tags:
     def __init__(self, description: Description) -> None:
         self.description = description
         self._read: set[Element] = set()
+        self.fields: dict[Element, str] = {}
+        """Names, in the tables of `extensions`, of numbers that were read."""
 
     def blocks(self, tag: str) -> list[Element]:
         """Elements called `tag` directly below `<robot>`; marks them, but not their children."""
@@ -107,6 +109,7 @@ class Tags:
     def figures(self, element: Element, table: Mapping[str, Figure]) -> dict[str, float]:
         """The numbers of a table that an element gives, by name."""
         read = {n: self.number(element, *f.paths, least=f.least, above=f.above) for n, f in table.items()}
+        self.fields |= {e: n for n, f in table.items() if (e := self.find(element, *f.paths)) is not None}
         return {name: value for name, value in read.items() if value is not None}
 
     def nothing(self, element: Element | None, *paths: str) -> None:
@@ -141,20 +144,16 @@ class Tags:
         """
         texts: dict[str, list[str]] = {}
         counts: Counter[str] = Counter()
-        for owner, depth, left in self._left():
-            way = left.way[depth:]
-            counts["/".join((*(e.tag for e in way), left.name))] += left.known
-            value = f"{left.name[1:]}={left.way[-1].get(left.name[1:])!r}"
-            text = value if left.element is None else plain_text(left.element)
-            inside = "/".join(_label(e) for e in way)
-            texts.setdefault(owner, []).append(f"{inside}: {text}" if inside else text)
+        for owner, depth, left in self.left():
+            counts["/".join((*(e.tag for e in left.way[depth:]), left.name))] += left.known
+            texts.setdefault(owner, []).append(text_of(left, depth))
         for owner, kept in texts.items():
             prim = prim_of(owner)
             there = prim.GetCustomDataByKey(KEPT) or ()
             prim.SetCustomDataByKey(KEPT, Vt.StringArray([*there, *kept]))
         return {name: count for name, count in sorted(counts.items()) if count}
 
-    def _left(self) -> Iterator[tuple[str, int, Unused]]:
+    def left(self) -> Iterator[tuple[str, int, Unused]]:
         """What is not used; the name of its link or joint, and the depth of the elements inside that."""
         for one in unused(self.description.xml):
             if len(one.way) > 1:
@@ -184,7 +183,15 @@ def _text_of(element: Element) -> str:
     return (element.text or "").strip() or element.get("value", "").strip()
 
 
-def _label(element: Element) -> str:
+def text_of(left: Unused, depth: int) -> str:
+    """The text by which `keep` keeps what is not used, with the elements that hold it from a depth on."""
+    inside = "/".join(label_of(e) for e in left.way[depth:])
+    value = f"{left.name[1:]}={left.way[-1].get(left.name[1:])!r}"
+    text = value if left.element is None else plain_text(left.element)
+    return f"{inside}: {text}" if inside else text
+
+
+def label_of(element: Element) -> str:
     """Tag of an element, with its name if it has one."""
     name = element.get("name")
     return f"{element.tag}({name})" if name else element.tag

@@ -51,24 +51,31 @@ def is_marker(link: Link) -> bool:
     return link.inertial is None and not link.visuals and not link.collisions
 
 
-def define_body(prim: Usd.Prim, parts: Sequence[Rider], description: Description) -> None:
+def define_body(
+    prim: Usd.Prim, parts: Sequence[Rider], description: Description, density: float = WATER
+) -> dict[str, MassProperties]:
     """Make an Xform a rigid body with the total mass, centre and principal inertia of its links.
 
-    A body of links without mass gets that of its colliders at `WATER`, as engines compute it, or else
-    `MASSLESS_KG`.
+    A body of links without mass gets that of its shapes at a density, see `_filled`, or else `MASSLESS_KG`.
 
     Args:
         prim: The Xform, with its shapes below it.
         parts: The body's own link, and links merged into it.
         description: Receives notes of repairs and guesses.
+        density: Density of links without mass [kg/m3].
+
+    Returns:
+        Mass properties, in the body's frame, of the links that were filled, by name.
     """
     prim.AddAppliedSchema(LINK_API)
     UsdPhysics.RigidBodyAPI.Apply(prim).CreateRigidBodyEnabledAttr(True)
     parts = [part for part in parts if part is parts[0] or not is_marker(part.link)]
     known = [_mass_properties(part, prim, description) for part in parts if part.link.inertial is not None]
-    if not known:
-        filled = (_filled(part, prim, description) for part in parts if part.colliders)
-        known = [each for each in filled if each is not None] or [_massless(parts[0], prim, description)]
+    filled: dict[str, MassProperties] = {}
+    for part in () if known else parts:
+        solid = _filled(part, prim, description, density)
+        filled |= {} if solid is None else {part.link.name: solid}
+    known = known or list(filled.values()) or [_massless(parts[0], prim, description)]
     whole = known[0] if len(known) == 1 else combined(known)
     mass = UsdPhysics.MassAPI.Apply(prim)
     mass.CreateMassAttr(whole.mass)
@@ -78,6 +85,7 @@ def define_body(prim: Usd.Prim, parts: Sequence[Rider], description: Description
     moments, q = principal_axes(tensor)
     mass.CreateDiagonalInertiaAttr(_single(moments, turned=abs(q[3]) < 1))
     mass.CreatePrincipalAxesAttr(Gf.Quatf(*(round(float(v), 7) + 0.0 for v in wxyz_from_xyzw(q))))
+    return filled
 
 
 def _single(moments: NDArray, *, turned: bool) -> Gf.Vec3f:
@@ -121,22 +129,29 @@ def _mass_properties(part: Rider, body: Usd.Prim, description: Description) -> M
     return MassProperties(mass, centre, mass / solid.mass * solid.inertia)
 
 
+def _filled(part: Rider, body: Usd.Prim, description: Description, density: float) -> MassProperties | None:
+    """Mass properties of a link without `<inertial>`: its colliders at a density, or else its visuals.
+
+    Engines fill colliders too. Visuals are filled only where no link of the robot has an `<inertial>`.
+    """
+    bare = all(link.inertial is None for link in description.links.values())
+    for what, shapes in ("colliders", part.colliders), ("visuals", part.visuals if bare else []):
+        solid = read_solid(shapes, body)
+        if solid is not None:
+            mass, name = density * solid.mass, part.link.name
+            description.note(
+                f"link {name!r} has no <inertial>: {mass:.3g} kg, its {what} at {density:g} kg/m3"
+            )
+            return MassProperties(mass, solid.centre, density * solid.inertia)
+    return None
+
+
 def _massless(part: Rider, body: Usd.Prim, description: Description) -> MassProperties:
-    """Mass properties of a body whose links have no mass: `MASSLESS_KG`, spread over its shapes."""
+    """Mass properties of a body whose links have no mass: `MASSLESS_KG`, spread over its visuals."""
     kg = MASSLESS_KG
     description.note(f"link {part.link.name!r} has no <inertial>: {kg:g} kg, so that engines add none")
     solid = read_solid(part.visuals, body) or ball_of(kg)
     return MassProperties(kg, solid.centre, kg / solid.mass * solid.inertia)
-
-
-def _filled(part: Rider, body: Usd.Prim, description: Description) -> MassProperties | None:
-    """Mass properties of the colliders of a link without `<inertial>` at the density of water."""
-    solid = read_solid(part.colliders, body)
-    if solid is None:
-        return None
-    mass, name = WATER * solid.mass, part.link.name
-    description.note(f"link {name!r} has no <inertial>: {mass:.3g} kg, its colliders at {WATER:g} kg/m3")
-    return MassProperties(mass, solid.centre, WATER * solid.inertia)
 
 
 def _turned(inertia: NDArray, origin: NDArray) -> NDArray[np.float64]:

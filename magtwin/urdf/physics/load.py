@@ -31,8 +31,10 @@ class Load:
     """Size of the axis' component along the root's z at rest."""
 
 
-def read_loads(description: Description, poses: Mapping[str, NDArray]) -> dict[str, Load]:
-    """The load of each joint by name, from the masses and tensors that the description gives.
+def read_loads(
+    description: Description, poses: Mapping[str, NDArray], filled: Mapping[str, MassProperties]
+) -> dict[str, Load]:
+    """The load of each joint by name, from the masses and tensors that the description gives, or `filled`.
 
     About an axis u through p, bodies of total mass M, centre C and tensor I_C about C have (Goldstein 2002,
     section 5.3)
@@ -42,12 +44,13 @@ def read_loads(description: Description, poses: Mapping[str, NDArray]) -> dict[s
     Args:
         description: Links and joints.
         poses: T_root_link of each link, parents before children, shape (4, 4) each.
+        filled: Mass properties of links without `<inertial>`, in the root's frame.
     """
     whole = {
         name: _body(inertial, T)
         for name, T in poses.items()
         if (inertial := description.links[name].inertial) is not None and inertial.mass
-    }  # of each link and, below, of all links beyond it
+    } | dict(filled)  # of each link and, below, of all links beyond it
     for child in reversed(list(poses)):
         if child in description.joints and child in whole:
             parent = description.joints[child].parent

@@ -1,7 +1,7 @@
 """Mechanism: which joints move, which follow another, and the rest position of each."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.urdf.description.description import Description, origin_of
 from magtwin.urdf.description.model import Joint, Mimic
 from magtwin.urdf.options import DEFAULTS, Options
+from magtwin.urdf.physics.inertia import MassProperties
 from magtwin.urdf.physics.load import Load, read_loads
 
 SINGLE = ("revolute", "continuous", "prismatic")
@@ -34,6 +35,9 @@ class Mechanism:
     rests: Mapping[str, float]
     """Authored value of joints that do not rest at 0 [rad or m]."""
 
+    filled: dict[str, MassProperties] = field(default_factory=dict)
+    """Mass properties in the root's frame of links without `<inertial>`; known when bodies are authored."""
+
     def pose(self, joint: Joint) -> NDArray[np.float64]:
         """T_parent_child of a joint's links at rest, shape (4, 4)."""
         T, rest = origin_of(joint), self.rests.get(joint.name, 0.0)
@@ -42,7 +46,7 @@ class Mechanism:
     @cached_property
     def loads(self) -> Mapping[str, Load]:
         """What each joint carries, by name."""
-        return read_loads(self.description, self.poses())
+        return read_loads(self.description, self.poses(), self.filled)
 
     def carriers(self, kinds: Iterable[str]) -> frozenset[str]:
         """Joints beyond which a joint of one of some types moves."""

@@ -32,6 +32,9 @@ CASTER_NAMES = ("caster", "castor")
 WHEEL_HEIGHT_M = 0.4
 """Largest height of a wheel's axle above the lowest link of the robot [m]; fingers are higher."""
 
+STIFFER = 5.0
+"""Gain of a driven wheel over that by which the robot alone answers within `RESPONSE`: wheels lag less."""
+
 FLOOR = 0.002
 """Height above the lowest point of the wheels within which other parts touch the floor [m]."""
 
@@ -104,10 +107,9 @@ def not_on(wheels: Iterable[str], rules: Iterable[DriveRule]) -> tuple[DriveRule
 def fit_wheels(mechanism: Mechanism, wheels: Iterable[str], bodies: Mapping[str, Usd.Prim]) -> Wheels:
     """Drives of the wheels, from the robot's mass m, the number of wheels n and their radius r.
 
-    Gain kd = m r^2 / (n t): the robot reaches a commanded speed within about t = RESPONSE. Torque
-    mu m g r / n: the most that the floor can take. In Newton 1.8, a robot of 5.4 kg at 120 to 500 steps a
-    second follows a step of the command to 3 %. Ten times the gain needs 500 steps, because the solver
-    slows a saturated drive by kd dt as if that were inertia.
+    Gain kd = 5 m r^2 / (n t), t = RESPONSE. Torque mu m g r / n: the most that the floor can take. Ten times
+    that gain needs 500 steps a second in Newton 1.8, whose solver slows a saturated drive by kd dt as if that
+    were inertia.
 
     Args:
         mechanism: Joints of the description.
@@ -129,7 +131,7 @@ def fit_wheels(mechanism: Mechanism, wheels: Iterable[str], bodies: Mapping[str,
         fitted[name] = (WHEEL_DAMPING, DEFAULT_EFFORT)
         if share * radius > 0:
             torque = WHEEL_FRICTION * share * GRAVITY * radius
-            damping = share * radius**2 / RESPONSE
+            damping = STIFFER * share * radius**2 / RESPONSE
             fitted[name] = (float(f"{damping:.3g}"), float(f"{torque:.3g}"))
     return fitted
 

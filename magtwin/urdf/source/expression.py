@@ -1,6 +1,6 @@
 """Expression: an interpreter for xacro's `${...}`, so that a description never runs Python code.
 
-The language is a subset of Python: numbers, strings, lists, tuples and dictionaries; property names;
+The language is a subset of Python: numbers, strings, lists, tuples, dictionaries and sets; property names;
 `+ - * / // % **`, comparisons, `and or not in`, `x if c else y`, indices and slices; comprehensions and
 `lambda`; the functions in `GLOBALS` and the methods in `METHODS`. A dot reads a key of a dictionary. There
 are no other attributes or names, no files and no imports. A `Budget` limits time and memory.
@@ -24,6 +24,9 @@ LARGEST = 65_536
 
 BITS = 4_096
 """Most bits of an integer."""
+
+FACTORS = 500
+"""Most factors of a product, so that it has no more bits."""
 
 
 NODE, SCOPE = 2, 4
@@ -72,18 +75,54 @@ def _sum(values: Any, start: float = 0) -> float:
 
 
 class _Set(list[Any]):
-    """A set in a fixed order, so that output is reproducible."""
+    """A set in the order of its entries' first mention, so that output is reproducible."""
 
-    def __sub__(self, other: Any) -> "_Set":
-        left_out = dict.fromkeys(other)
-        return _Set(value for value in self if value not in left_out)
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return f"{{{', '.join(map(repr, self))}}}" if self else "set()"
+
+
+def _operation(name: str) -> Callable[[_Set, Any], Any]:
+    """An operator of sets for `_Set`: a set in order, or whether it compares so."""
+
+    def apply(left: _Set, right: Any) -> Any:
+        both = dict.fromkeys([*left, *right]) if isinstance(right, list) else {}
+        made = getattr(set(left), name)(set(right) if isinstance(right, list) else right)
+        return _Set(entry for entry in both if entry in made) if isinstance(made, set) else made
+
+    return apply
+
+
+for _name in ("and", "or", "sub", "xor", "eq", "le", "lt", "ge", "gt"):
+    setattr(_Set, f"__{_name}__", _operation(f"__{_name}__"))
+
+
+def _bounded(count: int) -> int:
+    """A count of factors whose product is not too long."""
+    if not 0 <= count <= FACTORS:
+        raise ExpressionError(f"a product of over {FACTORS} factors")
+    return count
+
+
+def _prod(values: Any, start: float = 1) -> float:
+    values = [start, *values]
+    if not all(isinstance(value, int | float) for value in values):
+        raise ExpressionError("prod takes numbers only")
+    if sum(value.bit_length() for value in values if isinstance(value, int)) > BITS:
+        raise ExpressionError(f"an integer of over {BITS} bits")
+    return math.prod(values)
 
 
 _UNBOUNDED = ("factorial", "comb", "perm", "prod", "lcm")
 
 MATH = {name: f for name, f in vars(math).items() if not name.startswith("_") and name not in _UNBOUNDED}
+MATH |= {"factorial": lambda n: math.factorial(_bounded(n)), "prod": _prod}
+MATH |= {"comb": lambda n, k: math.comb(_bounded(n), k), "perm": lambda n, *k: math.perm(_bounded(n), *k)}
 
-_PLAIN = (abs, all, any, bool, dict, divmod, float, int, len, list, max, min, ord, repr, sorted, str, tuple)
+_PLAIN = (
+    *(abs, all, any, bool, dict, divmod, float, int, len, list, max, min, ord, repr, sorted, str, tuple),
+)
 
 PYTHON: Mapping[str, Any] = {
     **{f.__name__: f for f in _PLAIN},
@@ -93,6 +132,15 @@ PYTHON: Mapping[str, Any] = {
     "set": lambda values=(): _Set(dict.fromkeys(values)),
     "sum": _sum,
     "isinstance": isinstance,
+}
+
+SET_METHODS: Mapping[str, Callable[..., Any]] = {
+    "difference": operator.sub,
+    "intersection": operator.and_,
+    "issubset": operator.le,
+    "issuperset": operator.ge,
+    "symmetric_difference": operator.xor,
+    "union": operator.or_,
 }
 
 _BARE = (bool, dict, float, int, len, list, map, max, min, range, round, set, sorted, str)
@@ -110,12 +158,16 @@ _SIZED = (str, list, tuple, dict)
 METHODS: Mapping[type, frozenset[str]] = {
     str: frozenset(
         (
-            *("capitalize", "count", "endswith", "find", "index", "isdigit", "join", "lower", "lstrip"),
-            *("replace", "rstrip", "split", "startswith", "strip", "title", "upper"),
+            *("capitalize", "casefold", "count", "endswith", "find", "index", "isalnum", "isalpha"),
+            *("isascii", "isdecimal", "isdigit", "isidentifier", "islower", "isnumeric", "isspace"),
+            *("istitle", "isupper", "join", "lower", "lstrip", "partition", "removeprefix"),
+            *("removesuffix", "replace", "rfind", "rindex", "rpartition", "rsplit", "rstrip", "split"),
+            *("splitlines", "startswith", "strip", "swapcase", "title", "upper"),
         )
     ),
     list: frozenset({"count", "index"}),
     tuple: frozenset({"count", "index"}),
+    _Set: frozenset(SET_METHODS),
     dict: frozenset({"get", "items", "keys", "values"}),
 }
 """Allowed methods by type."""
@@ -128,6 +180,12 @@ OPERATORS: Mapping[type[ast.AST], Callable[..., Any]] = {
     ast.FloorDiv: operator.floordiv,
     ast.Mod: operator.mod,
     ast.Pow: operator.pow,
+    ast.BitAnd: operator.and_,
+    ast.BitOr: operator.or_,
+    ast.BitXor: operator.xor,
+    ast.LShift: operator.lshift,
+    ast.RShift: operator.rshift,
+    ast.Invert: operator.invert,
     ast.UAdd: operator.pos,
     ast.USub: operator.neg,
     ast.Not: operator.not_,
@@ -241,23 +299,16 @@ class _Interpreter:
                 return self._call(node)
             case ast.BinOp() if type(node.op) in OPERATORS:
                 return self._binary(node.op, self.value(node.left), self.value(node.right))
-            case ast.UnaryOp() if type(node.op) in OPERATORS:
+            case ast.UnaryOp():
                 return OPERATORS[type(node.op)](self.value(node.operand))
             case ast.BoolOp():
-                for operand in node.values:
+                for operand in node.values[:-1]:
                     result = self.value(operand)
                     if bool(result) is isinstance(node.op, ast.Or):
-                        break
-                return result
+                        return result
+                return self.value(node.values[-1])
             case ast.Compare():
-                left = self.value(node.left)
-                for comparison, operand in zip(node.ops, node.comparators, strict=True):
-                    right = self.value(operand)
-                    self._pay(comparison, left, right)
-                    if not OPERATORS[type(comparison)](left, right):
-                        return False
-                    left = right
-                return True
+                return self._compared(node)
             case ast.IfExp():
                 return self.value(node.body if self.value(node.test) else node.orelse)
             case ast.Subscript():
@@ -267,27 +318,40 @@ class _Interpreter:
                 ends = (node.slice.lower, node.slice.upper, node.slice.step)
                 part = values[slice(*(None if end is None else self.value(end) for end in ends))]
                 return check_size(part, self._budget)
-            case ast.List() | ast.Tuple():
-                values = [self.value(entry) for entry in node.elts]
-                return check_size(tuple(values) if isinstance(node, ast.Tuple) else values, self._budget)
-            case ast.Dict() if None not in node.keys:
-                pairs = zip(node.keys, node.values, strict=True)
-                return check_size({self.value(k): self.value(v) for k, v in pairs if k}, self._budget)
-            case ast.ListComp() | ast.GeneratorExp():
+            case ast.List() | ast.Tuple() | ast.Set():
+                return check_size(KINDS.get(type(node), list)(self._all(node.elts)), self._budget)
+            case ast.Dict():
+                made: dict[Any, Any] = {}
+                for key, entry in zip(node.keys, node.values, strict=True):
+                    made |= self.value(entry) if key is None else {self.value(key): self.value(entry)}
+                return check_size(made, self._budget)
+            case ast.ListComp() | ast.GeneratorExp() | ast.SetComp():
                 values = []
                 for scope in self._scopes(node.generators):
                     values.append(scope.value(node.elt))
                     _check_length(len(values))
-                return check_size(values, self._budget)
+                return check_size(KINDS.get(type(node), list)(values), self._budget)
             case ast.DictComp():
                 scopes = self._scopes(node.generators)
                 return check_size({s.value(node.key): s.value(node.value) for s in scopes}, self._budget)
             case ast.Lambda():
-                names = [argument.arg for argument in node.args.args]
-                if len(names) != sum(1 for _ in ast.walk(node.args)) - 1:
-                    raise ExpressionError("a lambda takes plain arguments only")
-                return lambda *values: self._inside(dict(zip(names, values, strict=True))).value(node.body)
+                return self._lambda(node)
+            case ast.JoinedStr():
+                texts = [self.value(part) for part in node.values]
+                return check_size("".join(texts), self._budget)
+            case ast.FormattedValue():
+                return self._formatted(node)
         raise ExpressionError(f"{type(getattr(node, 'op', node)).__name__} is not allowed")
+
+    def _compared(self, node: ast.Compare) -> bool:
+        left = self.value(node.left)
+        for comparison, operand in zip(node.ops, node.comparators, strict=True):
+            right = self.value(operand)
+            self._pay(comparison, left, right)
+            if not OPERATORS[type(comparison)](left, right):
+                return False
+            left = right
+        return True
 
     def _name(self, name: str) -> Any:
         if name in self._inner:
@@ -313,20 +377,51 @@ class _Interpreter:
         function = self._function(node.func)
         if not callable(function):
             raise ExpressionError(f"a {type(function).__name__} cannot be called")
-        arguments: list[Any] = []
-        for argument in node.args:
-            if isinstance(argument, ast.Starred):
-                arguments += self.value(argument.value)
-            else:
-                arguments.append(self.value(argument))
-        options = {}
+        arguments, options = self._all(node.args), dict[str, Any]()
         for keyword in node.keywords:
-            if keyword.arg is None:
-                raise ExpressionError("** is not allowed in a call")
-            options[keyword.arg] = self.value(keyword.value)
+            given = self.value(keyword.value)
+            options |= given if keyword.arg is None else {keyword.arg: given}
         for value in (*arguments, *options.values()):  # paid for before the function works on it
             check_size(value, self._budget)
         return check_size(function(*arguments, **options), self._budget)
+
+    def _all(self, nodes: list[ast.expr]) -> list[Any]:
+        """Values of the entries of a list or call; those with a star are unpacked."""
+        values: list[Any] = []
+        for node in nodes:
+            if isinstance(node, ast.Starred):
+                values += _entries(self.value(node.value))
+            else:
+                values.append(self.value(node))
+            _check_length(len(values))
+        return values
+
+    def _lambda(self, node: ast.Lambda) -> Callable[..., Any]:
+        """A function of plain arguments, the last of which may have defaults."""
+        names = [argument.arg for argument in node.args.args]
+        if node.args.vararg or node.args.kwarg or node.args.kwonlyargs or node.args.posonlyargs:
+            raise ExpressionError("a lambda takes plain arguments only")
+        first = len(names) - len(node.args.defaults)
+        usual = dict(zip(names[first:], map(self.value, node.args.defaults), strict=True))
+
+        def function(*values: Any, **options: Any) -> Any:
+            given = usual | dict(zip(names, values, strict=False)) | options
+            if len(values) > len(names) or given.keys() != set(names):
+                raise TypeError(f"a lambda takes {', '.join(names) or 'no arguments'}")
+            return self._inside(given).value(node.body)
+
+        return function
+
+    def _formatted(self, node: ast.FormattedValue) -> str:
+        """A value in an f-string; its format has at most two digits in a row."""
+        value = self.value(node.value)
+        form = "" if node.format_spec is None else str(self.value(node.format_spec))
+        if re.search(r"\d{3}", form):
+            raise ExpressionError("a format of over two digits is not allowed")
+        check_size(value, self._budget, plain=True)
+        if node.conversion in (ord("r"), ord("a")):
+            value = repr(value)
+        return format(value, form)
 
     def _function(self, node: ast.expr) -> Any:
         """The function or bound method that a call names."""
@@ -348,7 +443,10 @@ class _Interpreter:
             for values, times in ((left, right), (right, left)):
                 if isinstance(values, str | list | tuple) and isinstance(times, int):
                     _check_length(len(values) * times)
-        if isinstance(left, _Set):  # paid for before they are compared
+        shifts = isinstance(kind, ast.LShift) and isinstance(left, int) and isinstance(right, int)
+        if shifts and left.bit_length() + right > BITS:
+            raise ExpressionError(f"an integer of over {BITS} bits")
+        if isinstance(left, _Set | dict):  # paid for before they are compared
             check_size([left, right], self._budget)
         integers = isinstance(left, int) and isinstance(right, int)
         if isinstance(kind, ast.Pow) and integers and left.bit_length() * abs(right) > BITS:
@@ -399,6 +497,14 @@ def _entries(values: Any) -> Any:
     return values
 
 
+KINDS: Mapping[type[ast.AST], Callable[..., Any]] = {
+    ast.Tuple: tuple,
+    ast.Set: lambda values: _Set(dict.fromkeys(values)),
+    ast.SetComp: lambda values: _Set(dict.fromkeys(values)),
+}
+"""What a display makes of its entries; the others make lists."""
+
+
 def _check_length(length: int) -> None:
     if length > LARGEST:
         raise ExpressionError(f"a value of over {LARGEST} characters or entries")
@@ -422,5 +528,7 @@ def _call_method(holder: Any, name: str, *arguments: Any) -> Any:
     if name == "join":
         arguments = (list(arguments[0]),)
         _check_length(sum(map(len, arguments[0])) + len(holder) * len(arguments[0]))
+    if isinstance(holder, _Set):
+        return SET_METHODS[name](holder, _Set(dict.fromkeys(arguments[0])))
     result = getattr(holder, name)(*arguments)
     return list(result) if name in ("items", "keys", "values") else result

@@ -6,6 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from magtwin.errors import InputError, hint, near
+from magtwin.files.folders import allowed_folders
 from magtwin.urdf.source.markup import read_markup
 
 MANIFEST = "package.xml"
@@ -49,14 +50,22 @@ class Packages:
     executed, and symbolic links around the file are not followed.
     """
 
-    def __init__(self, given: Mapping[str, Path], file: Path) -> None:
+    def __init__(self, given: Mapping[str, Path], file: Path, root: Path | None = None) -> None:
+        """Arguments: given packages, the description, and the folder from which its name was given."""
         for name, folder in given.items():
             if not Path(folder).is_dir():
                 raise InputError(f"package {name!r}: {folder} is not a folder; give --package {name}=FOLDER")
         self._given = {name: Path(folder).resolve() for name, folder in given.items()}
         self._folder = file.resolve().parent
-        self._above = [p for p in (self._folder, *self._folder.parents) if (p / MANIFEST).is_file()]
-        beside = self._folder.parent if not self._above and self._folder.name in SUBFOLDERS else None
+        folders = (self._folder, *self._folder.parents)
+        self._above = [p for p in folders if (p / MANIFEST).is_file()]
+        trusted = [p for p in folders if p in self._above or (p / ".git").exists()]
+        whole = (Path.home(), folders[-1])  # of a user, and of a machine
+        trusted += [p for p in folders if root is not None and p == root.resolve() and p not in whole]
+        self.home: Path = trusted[0] if trusted else self._folder
+        """Folder that the file may read: the nearest above it with `package.xml` or `.git`, or `root`, or its
+        own."""
+        beside = self._folder.parent if not trusted and self._folder.name in SUBFOLDERS else None
         self._beside = [beside / name for name in BESIDE] if beside else []
         self._found: dict[str, list[Path]] | None = None
         self._installed: dict[str, Path] = {}
@@ -64,10 +73,13 @@ class Packages:
         self.notes: list[str] = []
         """Ambiguous packages, one line each."""
 
-    @property
-    def home(self) -> Path:
-        """Folder that the file may read by relative paths: that of its package, otherwise its own."""
-        return self._above[0] if self._above else self._folder
+    def up(self) -> list[Path]:
+        """The folders from that of the file up to `home`."""
+        return [p for p in (self._folder, *self._folder.parents) if p.is_relative_to(self.home)]
+
+    def known(self) -> dict[str, list[Path]]:
+        """Folders of the packages given and found, by name."""
+        return self._search() | {name: [folder] for name, folder in self._given.items()}
 
     def find(self, name: str) -> Path:
         """Folder of a package.
@@ -90,6 +102,7 @@ class Packages:
             for parent in (self._folder, *self._folder.parents[:DEPTH]):
                 for path in (parent, parent / name):
                     if path.name == name and (path == self._folder or _looks_like_package(path)):
+                        self._installed[name] = path.resolve()
                         return path
             folder = self._installed.get(name) or _installed(name)
             if folder is not None:
@@ -105,13 +118,13 @@ class Packages:
         raise error
 
     def holds(self, path: Path) -> bool:
-        """Whether a file lies in the home folder, beside it (see BESIDE), or in a package.
+        """Whether a file lies in the home folder, beside it (see BESIDE), in a package, or where `allow` is.
 
         Packages are those given, those around the file, and those of ROS that `find` found.
         """
         path, installed = path.resolve(), self._installed.values()
-        allowed = (self.home, *self._given.values(), *self._beside, *installed)
-        if any(path.is_relative_to(folder) for folder in allowed):
+        allowed = (self.home, *self._given.values(), *self._beside, *installed, *allowed_folders())
+        if any(path.is_relative_to(str(folder)) for folder in allowed):
             return True
         return any(path.is_relative_to(p) for folders in self._search().values() for p in folders)
 
@@ -120,7 +133,7 @@ class Packages:
             self._found, left = {}, FOLDERS
             for folder in self._above:
                 _add(folder, self._found)
-            for base in [p.parent for p in self._above] or [self._folder]:
+            for base in [p.parent for p in self._above] or dict.fromkeys((self._folder, self.home)):
                 for folder in _below(base, DEPTH):
                     left -= 1
                     if left < 0:

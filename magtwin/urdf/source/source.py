@@ -1,6 +1,7 @@
 """Source: a robot description as plain URDF, with the files and packages around it."""
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,6 +15,12 @@ from magtwin.files.file import existing
 from magtwin.urdf.repairs import Repairs
 from magtwin.urdf.source.markup import UnsafeError, read_markup
 from magtwin.urdf.source.package import MissingFileError, Packages
+
+SCHEMES = ("package", "model")
+"""Schemes of names in packages."""
+
+_SCHEME, _ODD = re.compile("(package|model|file):"), re.compile("(package|model):(?!//[^/])")
+"""A name with a scheme, and one with too few or too many slashes after it."""
 
 EXPANDER = "magtwin.urdf.source.xacro"
 """Module of macros, with its interpreter, which a plain URDF does not need."""
@@ -37,6 +44,9 @@ class Source:
 
     repairs: Repairs = field(default_factory=Repairs)
     """Receives every repair and note of the conversion; those of the expansion so far."""
+
+    _advised: set[Path] = field(default_factory=set)
+    """Folders of missing files for which a near name was looked for."""
 
     @cached_property
     def elements(self) -> Mapping[tuple[str, str], ElementTree.Element]:
@@ -71,62 +81,97 @@ class Source:
         return Path(os.path.relpath(file, self.path.parent)).as_posix(), line
 
     def find_file(self, filename: str, what: str, element: ElementTree.Element | None = None) -> Path:
-        """The file that a `filename=` refers to.
+        """The file that a `filename=` refers to: the first of `_candidates` that exists and may be read.
 
-        `package://NAME/rest` and `model://NAME/rest` lie in that package. Any other name is relative to the
-        folder of the description, or else to its package, and may lie in its package or in other packages.
+        Any but the first is a repair. What lies outside the trusted area and all packages is never read.
 
         Args:
             filename: Name in the description.
-            what: Kind of file ("mesh", "texture"), for error messages.
-            element: Element with the name, for error messages.
+            what: Kind of file ("mesh", "texture"), for messages.
+            element: Element with the name, for messages.
 
         Raises:
-            MissingFileError: The file or its package does not exist; the message suggests a near name. Or
-                its scheme is unknown, such as https: nothing is downloaded.
+            MissingFileError: The file or its package does not exist; the message suggests a near name, once
+                for each folder. Or its scheme is unknown, such as https: nothing is downloaded.
             UnsafeError: The description may not read the file.
             InputError: It cannot be looked for.
         """
         start = f"{self.where(element)}: {what} {filename!r}"
         try:
-            return self._locate(filename, what, start)
+            return self._locate(filename, what, start, element)
         except (OSError, RuntimeError) as error:  # the name is too long, or links form a circle
             reason = getattr(error, "strerror", None) or error
             raise InputError(f"{start} cannot be looked for ({reason})") from error
 
-    def _locate(self, filename: str, what: str, start: str) -> Path:
+    def _locate(self, filename: str, what: str, start: str, element: ElementTree.Element | None) -> Path:
         """The file of `find_file`; `start` begins its error messages."""
-        scheme, separator, rest = filename.partition("://")
-        if separator and scheme not in ("package", "model", "file"):
+        scheme, separator, _ = filename.partition("://")
+        if separator and scheme not in (*SCHEMES, "file"):
             raise MissingFileError(f"{start} has scheme {scheme!r}; known: file, model, package")
-        if separator and scheme != "file":
-            name, _, rest = rest.partition("/")
-            try:
-                folder = self.packages.find(name)
-            except MissingFileError as error:
-                missing = MissingFileError(f"{start} is in a package: {error}")
-                missing.supply, missing.near = error.supply, error.near
-                raise missing from error
-            path = Path(os.path.normpath(folder / rest))
-            inside = path.resolve().is_relative_to(folder.resolve())
-        else:
-            path = Path(os.path.normpath(self.path.resolve().parent / (rest if separator else filename)))
-            folder, inside = self.packages.home, self.packages.holds(path)
-            other = self.packages.home / filename
-            if inside and not path.is_file() and self.packages.holds(other) and other.is_file():
-                path = Path(os.path.normpath(other))
-        if not inside:
+        written, unknown = self._as_written(filename)
+        found = written if written and self.packages.holds(written) and written.is_file() else None
+        others = () if found else self._others(filename)
+        found = found or next((p for p in others if os.path.isfile(p) and self.packages.holds(p)), None)  # noqa: PTH113
+        if found is not None:
+            if found != written or "\\" in filename or _ODD.match(filename):
+                shown = Path(os.path.relpath(found, self.path.resolve().parent)).as_posix()
+                text = f"{what} {filename!r} is read as {shown!r}"
+                self.repairs.add("file-name", text, self.place(element))
+            return found
+        if unknown is not None:
+            missing = MissingFileError(f"{start} is in a package: {unknown}")
+            missing.supply, missing.near = unknown.supply, unknown.near
+            raise missing from unknown
+        assert written is not None
+        foreign = Path(filename.removeprefix("file://")).is_absolute() and not written.parent.is_dir()
+        if not self.packages.holds(written) and not foreign:
+            name = filename.partition("://")[2].partition("/")[0] if separator and scheme != "file" else ""
+            folder = self.packages.find(name) if name else self.packages.home
             raise UnsafeError(
                 f"{start} lies outside {folder}; files are read from there only: move it in, "
-                "or name its folder by --package NAME=FOLDER"
+                "name its folder by --package NAME=FOLDER, or --allow it"
             )
-        if not path.is_file():
-            siblings = (p.name for p in path.parent.iterdir()) if path.parent.is_dir() else ()
-            advice = self.repairs.suggestion(path.name, siblings, near)
-            absent = MissingFileError(f"{start} is missing{advice}; looked for {path}")
-            absent.near = advice
-            raise absent
-        return path
+        folder, advice = written.parent, ""
+        if folder.is_dir() and folder not in self._advised:
+            advice = self.repairs.suggestion(written.name, [p.name for p in folder.iterdir()], near)
+        self._advised.add(folder)
+        absent = MissingFileError(f"{start} is missing{advice}; looked for {written}")
+        absent.near = advice
+        raise absent
+
+    def _as_written(self, filename: str) -> tuple[Path | None, MissingFileError | None]:
+        """The file as the name says, in its package or beside the description; or why it is in no package."""
+        name, here = filename.replace("\\", "/"), self.path.resolve().parent
+        scheme, _, rest = name.partition(":") if _SCHEME.match(name) else ("", "", name)
+        if scheme in SCHEMES:
+            package, _, rest = rest.lstrip("/").partition("/")
+            if name.startswith(f"{scheme}:///") and (not rest or (here / package / rest).is_file()):
+                return Path(os.path.normpath(here / package / rest)), None  # it names no package
+            try:
+                return Path(os.path.normpath(self.packages.find(package) / rest)), None
+            except MissingFileError as error:
+                return None, error
+        return Path(os.path.normpath(here / rest.removeprefix("//"))), None
+
+    def _others(self, filename: str) -> list[Path]:
+        """Where else a file may be: its tail at each folder from the description up, then in packages.
+
+        The tail is the name without `..`, and what follows the name of a known package in it: a path of
+        another machine begins anew there. A file that several packages have is in none of them.
+        """
+        rest = filename.replace("\\", "/").rpartition(":")[2]
+        parts = [part for part in rest.split("/") if part not in ("", ".", "..")]
+        folders, known = self.packages.up(), self.packages.known()
+        rooted = [
+            folder.joinpath(*parts[i + 1 :]) for i in range(len(parts)) for folder in known.get(parts[i], ())
+        ]
+        tails = [parts, parts[1:]] if filename.partition(":")[0] in SCHEMES else [parts]
+        beside = [folders[0].joinpath(*parts[i:]) for i in range(len(parts))]
+        above = [folder.joinpath(*tail) for tail in tails for folder in folders if tail]
+        packages = {folder for some in known.values() for folder in some}
+        held = {folder.joinpath(*tail) for tail in tails if tail for folder in packages}
+        single = [path for path in held if os.path.isfile(path)]  # noqa: PTH113, which may raise
+        return [*rooted, *beside, *above, *(single if len(single) == 1 else ())]
 
 
 def read_source(
@@ -148,12 +193,12 @@ def read_source(
         InputError: The file is missing, is not XML, has a DOCTYPE, is not a `<robot>`, or has macros that
             cannot be expanded. The message gives the line.
     """
-    path = existing(path, "URDF file")
+    given, path = path, existing(path, "URDF file")
     markup = read_markup(path, "URDF file")
     if markup.root.tag != "robot":
         line = markup.lines[markup.root]
         raise InputError(f"{path}:{line}: a URDF begins with <robot>, this file with <{markup.root.tag}>")
-    around = Packages(packages, path)
+    around = Packages(packages, path, Path.cwd() if not Path(given).is_absolute() else None)
     if path.suffix == ".xacro" or any(element.tag.startswith("xacro:") for element in markup.lines):
         repairs, xacro = Repairs(), import_module(EXPANDER)
         xml, places = xacro.expand(
