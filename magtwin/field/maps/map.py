@@ -26,7 +26,8 @@ Array = NDArray[np.float64]
 
 TEXTS = ("name", "method", "source", "licence", "created", "frame", "datum")  # Metadata that are texts
 CONSTANT_NT = 1e-3  # Range of values up to which a map is constant [nT]
-OFFSET = "offset sd [nT]"  # Parameter of a map: see `AnomalyMap.offset_sd_nt`
+# Parameters of a map: see `AnomalyMap.offset_sd_nt` and `AnomalyMap.noise_nt2`
+OFFSET, NOISE = "offset sd [nT]", "noise of a reading [nT]"
 
 Outside = Literal["nan", "clamp", "raise"]
 
@@ -193,13 +194,14 @@ class AnomalyMap(Summarized):
         return self._look(p_xy, yaw, outside, gradient=True)[:2]
 
     def lookup_with_sd(
-        self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan"
+        self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan", reading: bool = False
     ) -> tuple[Array, Array]:
         """Field at poses, as by `lookup`, and its standard deviation.
 
         That is the root of the interpolated variance of the nodes and, if `between_nt2` is known, of the
         error of linear interpolation between nodes and between headings. It is 0 at nodes, where only their
-        own variance is left. The reference is the field that the survey's robot reads at rest.
+        own variance is left. The reference is the field that the survey's robot reads at rest; with
+        `reading`, a reading like those of the survey, so that `noise_nt2` is added.
 
         Returns:
             Field magnitude and its standard deviation [nT], each of shape (...).
@@ -208,7 +210,7 @@ class AnomalyMap(Summarized):
             InputError: The map has no variance; or an error of `lookup`.
         """
         value, _, sd = self._look(p_xy, yaw, outside, gradient=False, sd=True)
-        return value, sd
+        return value, np.sqrt(sd**2 + self.noise_nt2) if reading else sd
 
     def lookup_all(
         self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan"
@@ -307,7 +309,15 @@ class AnomalyMap(Summarized):
     @property
     def offset_sd_nt(self) -> float:
         """Standard deviation of an error that is alike all over the map [nT]; part of every variance."""
-        known = self.parameters.get(OFFSET)
+        return self._parameter(OFFSET)
+
+    @property
+    def noise_nt2(self) -> float:
+        """Variance of a reading of the survey about the map [nT^2], as its fit estimates it; 0 if unknown."""
+        return self._parameter(NOISE) ** 2
+
+    def _parameter(self, name: str) -> float:
+        known = self.parameters.get(name)
         return float(known) if isinstance(known, int | float) and 0 < known < np.inf else 0.0
 
     def relative(self) -> "AnomalyMap":

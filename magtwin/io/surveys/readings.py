@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.survey.folder import read_grid
+from magtwin.field.survey.onboard import signals_of
 from magtwin.field.survey.readings import TAKEN, Readings
 from magtwin.field.survey.saved import load_readings
 from magtwin.files.file import existing, sha256
@@ -109,7 +111,10 @@ def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
             vector = levelled(run["b_vector_measured_nt"], run["q_world_base_xyzw"], "body")
             known &= np.isfinite(vector).all(axis=1)
             body = vector[known]
+    signals, names = _signals(run)
     return Readings(
+        signals=None if signals is None else signals[known],
+        signal_names=names,
         p_xy=p[known, :2],
         yaw=yaw[known],
         b_nt=b[known],
@@ -120,6 +125,16 @@ def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
         name=name,
         source=source + left_out(known) + about,
     )
+
+
+def _signals(run: Run) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
+    """The on-board signals of a run's columns; none if it has none."""
+    columns = dict[str, NDArray[np.float64]]()
+    for name in ("wheel_angle", "lidar_on", "battery_a", "battery_v", "battery_fraction"):
+        values = np.asarray(run[name], float) if name in run else np.empty(0)
+        if len(values) and np.isfinite(values).all():
+            columns[name] = values
+    return signals_of(run["t"], columns) if columns else (None, ())
 
 
 def is_pattern(source: Source) -> bool:
@@ -209,10 +224,12 @@ def _together(parts: Sequence[Readings]) -> Readings:
         )
     first = np.cumsum([0] + [len(part.runs) for part in parts])
     arrays: dict[str, Any] = {"run": np.concatenate([p.run + n for p, n in zip(parts, first, strict=False)])}
-    for key in ("p_xy", "yaw", "b_nt", "b_body_nt", "t", "good"):
+    alike = all(part.signal_names == parts[0].signal_names for part in parts)
+    parts = parts if alike else [p.with_(signals=None, signal_names=()) for p in parts]
+    same: dict[str, Any] = {"signal_names": parts[0].signal_names}
+    for key in ("p_xy", "yaw", "b_nt", "b_body_nt", "t", "signals", "good"):
         values = [getattr(part, key) for part in parts]
         arrays[key] = None if any(v is None for v in values) else np.concatenate(values)
-    same: dict[str, Any] = {}
     unknown = {"created": "", "frame": "", "datum": "", "height_m": None, "earth_nt": None}
     for key, default in unknown.items():
         values_of = {getattr(part, key) for part in parts}
