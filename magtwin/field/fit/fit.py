@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.compiled import threads
 from magtwin.errors import InputError, hint
 from magtwin.field.fit.methods import METHODS, FieldModel, MapMethod
-from magtwin.field.fit.resolution import resolution
+from magtwin.field.fit.resolution import GOLDEN, resolution
 from magtwin.field.grid import TURN, Grid
 from magtwin.field.maps.curvature import interpolation_error_nt2
-from magtwin.field.maps.map import NOISE, OFFSET, AnomalyMap
+from magtwin.field.maps.map import NOISE, OFFSET, TABLED, AnomalyMap
 from magtwin.field.maps.statistics import offset_figures
 from magtwin.field.survey.axes import SurveyAxes, distinct, in_order, in_own_axes
 from magtwin.field.survey.bins import distance_m, spacing_m
@@ -39,6 +39,7 @@ ERRORS = ("error between nodes [nT]", "error between headings [nT]")
 # Standard deviation of what a robot adds alike throughout a drive [nT]: a constant of 500 and, by heading,
 # 400, as in drives of the shipped robot (`ROBOT_NOISE` of `magtwin.tasks.localizing`)
 OFFSET_SD_NT = 640.0
+TRIED = 2000  # Poses at which a map's table is compared with its model
 MOST_READ = 400  # Most readings of a drive at which the fields of its signals are averaged
 MOST_THREADS = 4  # Headings of a raster that are computed in parallel: each holds blocks of 100 MB
 
@@ -176,7 +177,7 @@ def raster(
             "theirs; mask readings that contradict each other"
         )
     read = model.method == "trilinear" and readings.grid is not None  # its nodes err independently
-    return AnomalyMap(
+    field = AnomalyMap(
         values_nt=values,
         valid=valid,
         variance_nt2=variance + offset**2 + readings.rounding_nt**2,
@@ -194,6 +195,18 @@ def raster(
         **readings.about,
         harmonic=getattr(model, "field", None),
     )
+    return _with_greatest_error(field) if field.holds_model else field
+
+
+def _with_greatest_error(field: AnomalyMap) -> AnomalyMap:
+    """The map with the greatest difference of its table from its model, at evenly spread poses."""
+    even = np.mod(0.5 + np.arange(1, TRIED + 1)[:, None] * GOLDEN, 1.0)
+    x0, x1, y0, y1 = field.extent
+    p, yaw = (x0, y0) + even[:, :2] * (x1 - x0, y1 - y0), TURN * even[:, 2]
+    error = np.abs(field.lookup(p, yaw) - field.exact(p, yaw))
+    known = error[np.isfinite(error)]
+    more = {TABLED: round(float(known.max()), 2)} if len(known) else {}
+    return replace(field, parameters={**field.parameters, **more})
 
 
 def offset_sd_nt(readings: Readings, signals: Collection[str] = ()) -> float:
@@ -232,6 +245,9 @@ def grid_report(field: AnomalyMap) -> Report:
     if field.variance_nt2 is not None and field.valid.any():
         sd = float(np.sqrt(np.median(field.variance_nt2[field.valid])))
         figures.append(Figure("standard deviation", round(sd, 1), "nT", note="median over the nodes"))
+    if TABLED in field.parameters:
+        note = "against the field of the fit, which the map holds (AnomalyMap.exact); of 2,000 poses"
+        figures.append(Figure("greatest error of interpolation", field.parameters[TABLED], "nT", note=note))
     figures += offset_figures(field)
     return Report("grid", tuple(figures), {})
 

@@ -24,8 +24,9 @@ FIELDS_NT: Mapping[str, float] = {
 }
 # Signals without which a map of one drive has an unknown offset, and the columns of a Run that tell them
 NEEDED = {"friction": "wheel_angle", "lidar": "lidar_on", "current": "battery_a"}
+COLUMNS = ("wheel_angle", "lidar_on", "battery_a", "battery_v", "battery_fraction")  # Of a Run, for signals
 CREEP = 0.05  # Rate of a wheel below which its friction falls in proportion [rad/s]
-SMOOTH_S = 0.2  # Time over which the rates of wheels are measured [s]
+SMOOTH_S = 0.2  # Time over which rates and accelerations of wheels are measured [s]
 
 
 def lacking(names: Collection[str]) -> list[str]:
@@ -40,27 +41,25 @@ def prior_sd_nt(names: tuple[str, ...]) -> Array:
 
 
 def signals_of(t: Array, columns: Mapping[str, Array]) -> tuple[Array, tuple[str, ...]]:
-    """The signals of a drive, shape (N, K), and their names.
-
-    Args:
-        t: Times [s], ascending, shape (N,).
-        columns: Columns of a Run by name: `wheel_angle`, `lidar_on`, `battery_a`, `battery_v`,
-            `battery_fraction`; those that are known.
-    """
+    """Signals (N, K) of a drive at times (N,) [s], and their names, from those of `COLUMNS` that it has."""
     signals = dict[str, Array]()
+    ends = np.clip(t + SMOOTH_S / 2 * np.array([[-1], [1]]), t[0], t[-1])
+
+    def slope(values: Array) -> Array:
+        return np.asarray(np.diff(np.interp(ends, t, values), axis=0)[0] / np.diff(ends, axis=0)[0])
+
     if (angles := columns.get("wheel_angle")) is not None:
-        ends = np.clip(t + SMOOTH_S / 2 * np.array([[-1], [1]]), t[0], t[-1])
         for side, angle in zip(("left", "right"), angles.T, strict=True):
-            rate = np.diff(np.interp(ends, t, angle), axis=0)[0] / np.diff(ends, axis=0)[0]
+            rate = slope(angle)
             signals[f"friction {side}"] = np.clip(rate / CREEP, -1, 1)
             signals[f"rate {side}"] = rate
-            signals[f"acceleration {side}"] = np.gradient(rate, t)
+            signals[f"acceleration {side}"] = slope(rate)
             signals[f"cos {side}"], signals[f"sin {side}"] = np.cos(angle), np.sin(angle)
     if "lidar_on" in columns:
         signals["lidar"] = columns["lidar_on"]
     if "battery_a" in columns:
         signals["current"] = _current(columns, signals)
-    return np.column_stack(list(signals.values())), tuple(signals)
+    return np.array([*signals.values()]).reshape(-1, len(t)).T, tuple(signals)
 
 
 def _current(columns: Mapping[str, Array], signals: Mapping[str, Array]) -> Array:
@@ -69,11 +68,11 @@ def _current(columns: Mapping[str, Array], signals: Mapping[str, Array]) -> Arra
     A battery reports its current rarely. The power U I = p_0 + p_1 on + p_2 (|w_l| + |w_r|) with the LiDAR's
     state and the wheels' rates, and the voltage U = u_0 + u_1 f with the charge f, are known at all times.
     """
-    current = columns["battery_a"]
-    one, work = np.ones(len(current)), [np.abs(s) for name, s in signals.items() if name.startswith("rate")]
-    uses = [one, *([signals["lidar"]] if "lidar" in signals else []), *([sum(work)] if work else [])]
+    one, volts = np.ones(len(columns["battery_a"])), columns.get("battery_v", np.zeros(1))
+    volts = volts if volts.min() > 0 else one
+    work = [np.abs(signal) for name, signal in signals.items() if name.startswith("rate")]
+    uses = np.column_stack([one, signals.get("lidar", 0 * one), sum(work, 0 * one)])
     charge = np.column_stack([one, columns.get("battery_fraction", one)])
-    volts = columns.get("battery_v", one)
     volt = np.linalg.lstsq(charge, volts, rcond=None)[0]
-    power = np.linalg.lstsq(np.column_stack(uses), volts * current, rcond=None)[0]
-    return np.asarray(np.column_stack(uses) @ power / (charge @ volt) - power[0] / volt.sum())
+    power = np.linalg.lstsq(uses, volts * columns["battery_a"], rcond=None)[0]
+    return np.asarray(uses @ power / (charge @ volt) - power[0] / max(volt.sum(), volts.min()))

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.field.survey.folder import read_grid
-from magtwin.field.survey.onboard import signals_of
+from magtwin.field.survey.onboard import COLUMNS, signals_of
 from magtwin.field.survey.readings import TAKEN, Readings
 from magtwin.field.survey.saved import load_readings
 from magtwin.files.file import existing, sha256
@@ -111,9 +110,10 @@ def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
             vector = levelled(run["b_vector_measured_nt"], run["q_world_base_xyzw"], "body")
             known &= np.isfinite(vector).all(axis=1)
             body = vector[known]
-    signals, names = _signals(run)
+    told = {name: run[name].astype(float) for name in COLUMNS if name in run}
+    signals, names = signals_of(t, {name: c for name, c in told.items() if np.isfinite(c).all()})
     return Readings(
-        signals=None if signals is None else signals[known],
+        signals=signals[known] if names else None,
         signal_names=names,
         p_xy=p[known, :2],
         yaw=yaw[known],
@@ -125,16 +125,6 @@ def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
         name=name,
         source=source + left_out(known) + about,
     )
-
-
-def _signals(run: Run) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
-    """The on-board signals of a run's columns; none if it has none."""
-    columns = dict[str, NDArray[np.float64]]()
-    for name in ("wheel_angle", "lidar_on", "battery_a", "battery_v", "battery_fraction"):
-        values = np.asarray(run[name], float) if name in run else np.empty(0)
-        if len(values) and np.isfinite(values).all():
-            columns[name] = values
-    return signals_of(run["t"], columns) if columns else (None, ())
 
 
 def is_pattern(source: Source) -> bool:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from magtwin.errors import InputError
 from magtwin.field.fit.fit import OFFSET_SD_NT, fit, offset_sd_nt, raster
-from magtwin.field.maps.map import NOISE, OFFSET
+from magtwin.field.maps.map import NOISE, OFFSET, TABLED
 from magtwin.field.sources.harmonic import HarmonicField
 from magtwin.field.survey.onboard import lacking, prior_sd_nt, signals_of
 from magtwin.field.survey.readings import Readings
@@ -101,6 +102,21 @@ def test_a_map_of_a_drive_is_that_of_the_robot_at_rest(room, drive):
     assert field.noise_nt2 > 200**2 > model.noise_nt2  # a reading has the fields of LiDAR and battery
     assert_allclose(field.lookup_with_sd(at, yaw, reading=True)[1] ** 2, sd**2 + field.noise_nt2)
     assert field.parameters[NOISE] == pytest.approx(field.noise_nt2**0.5)
+
+
+def test_a_harmonic_map_holds_the_field_of_its_fit_and_bounds_its_table(room, drive):
+    rng = np.random.default_rng(2)
+    model = fit(drive.with_(signals=None, signal_names=()).take(np.arange(0, 1500, 10)), "harmonic")
+    field = raster(model, drive, spacing_m=0.2)
+    p, yaw = drive.p_xy[rng.integers(len(drive), size=500)], rng.uniform(0, 2 * np.pi, 500)
+    known = np.isfinite(field.lookup(p, yaw))
+    exact, want = field.exact(p, yaw), model.predict(p, yaw)[0]
+    assert_allclose(exact[known], want[known], rtol=1e-10)
+    assert np.isnan(exact[~known]).all()
+    off = np.abs(field.lookup(p, yaw) - exact)[known]
+    assert 0.5 * off.max() < field.parameters[TABLED] < 10 * off.max()
+    with pytest.raises(InputError, match="does not hold the field"):
+        replace(field, values_nt=field.values_nt + 1.0).exact(p, yaw)
 
 
 def test_what_the_signals_lack_stays_an_offset_and_is_named(drive):
