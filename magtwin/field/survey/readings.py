@@ -158,6 +158,7 @@ class Readings(Summarized):
                 ("field", f"{span(good.min(), good.max(), 'nT')}, mean {good.mean():,.0f} nT{vectors}"),
                 ("runs", f"{len(self.runs):,}: {listed(self.runs)}" if any(self.runs) else ""),
                 ("known", ", ".join(about)),
+                ("signals", listed(self.signal_names)),
                 ("source", self.source),
             ),
         )
