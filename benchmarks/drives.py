@@ -6,7 +6,8 @@ Each drive is a random one of the default lab, at 17 Hz, with a physical magneto
 Of each, 15 % is left out in pieces of 10 s, and then a tenth of the floor in blocks of 0.6 m. Printed are
 the processor time of the whole command `magtwin map fit` on the whole drive, its peak memory, the root of the
 mean squared error on both kinds of readings left out, and the share of them in the 90 % intervals, noise
-included; the harmonic fit is told the signals of the robot there. The ratio is that of the time to the first method's, so that it carries over to other machines.
+included; the harmonic fit is told the robot's signals there. The ratio is that of the time to the first
+method's, so that it carries over to other machines.
 """
 
 import argparse

@@ -40,8 +40,10 @@ def prior_sd_nt(names: tuple[str, ...]) -> Array:
     return np.array([FIELDS_NT.get(name.split()[0], 100.0) for name in names])
 
 
-def signals_of(t: Array, columns: Mapping[str, Array]) -> tuple[Array, tuple[str, ...]]:
+def signals_of(t: Array, columns: Mapping[str, Array]) -> tuple[Array | None, tuple[str, ...]]:
     """Signals (N, K) of a drive at times (N,) [s], and their names, from those of `COLUMNS` that it has."""
+    if not columns or len(t) < 2 or np.any(np.diff(t) <= 0):
+        return None, ()
     signals = dict[str, Array]()
     ends = np.clip(t + SMOOTH_S / 2 * np.array([[-1], [1]]), t[0], t[-1])
 
@@ -59,7 +61,7 @@ def signals_of(t: Array, columns: Mapping[str, Array]) -> tuple[Array, tuple[str
         signals["lidar"] = columns["lidar_on"]
     if "battery_a" in columns:
         signals["current"] = _current(columns, signals)
-    return np.array([*signals.values()]).reshape(-1, len(t)).T, tuple(signals)
+    return np.column_stack([*signals.values()]) if signals else None, tuple(signals)
 
 
 def _current(columns: Mapping[str, Array], signals: Mapping[str, Array]) -> Array:

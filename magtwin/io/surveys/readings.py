@@ -110,10 +110,10 @@ def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
             vector = levelled(run["b_vector_measured_nt"], run["q_world_base_xyzw"], "body")
             known &= np.isfinite(vector).all(axis=1)
             body = vector[known]
-    told = {name: run[name].astype(float) for name in COLUMNS if name in run}
-    signals, names = signals_of(t, {name: c for name, c in told.items() if np.isfinite(c).all()})
+    told = {name: run[name][known].astype(float) for name in COLUMNS if name in run}
+    signals, names = signals_of(t[known], {name: c for name, c in told.items() if np.isfinite(c).all()})
     return Readings(
-        signals=signals[known] if names else None,
+        signals=signals,
         signal_names=names,
         p_xy=p[known, :2],
         yaw=yaw[known],

@@ -51,6 +51,7 @@ def test_signals_are_zero_at_rest_and_the_current_is_that_above_a_full_packs():
         assert_allclose(found[f"cos {side}"], np.cos(known["wheel_angle"][:, 0]))
     assert np.sqrt(np.mean((found["current"] - current) ** 2)) < 0.1 * current.std()
     assert lacking(names) == []
+    assert signals_of(t[:1], known) == signals_of(t[::-1], known) == signals_of(t, {}) == (None, ())
     assert lacking(("lidar",)) == ["wheel_angle", "battery_a"]
     assert len(prior_sd_nt(names)) == len(names)
     assert (prior_sd_nt(names) > 0).all()
