@@ -241,10 +241,9 @@ class Solution:
         )
         wide = figures.freedom / (figures.freedom - 2)
         noise = louder * wide * float(np.mean(figures.variance(slopes)))
-        off = good.b_nt - field.magnitude_nt(good.p_xy, good.yaw)
-        if good.signals is not None:
-            at = problem.forward.read(self.unknowns, good.p_xy, good.yaw, good.signals, vectors=False)
-            off = good.b_nt - at.values_nt[:, 0]
+        each = self.unknowns[len(self.unknowns) - 3 * len(good.signal_names) :].reshape(-1, 3)
+        own = 0.0 if good.signals is None else good.signals @ each
+        off = good.b_nt - field.magnitude_nt(good.p_xy, good.yaw, own_nt=own)
         within = off - (np.bincount(problem.cell, off) / np.bincount(problem.cell))[problem.cell]
         noise += float(np.mean(within**2))
         parameters = self._parameters(learnt, width, len(good))
