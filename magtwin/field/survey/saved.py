@@ -33,12 +33,12 @@ def save_readings(readings: Readings, path: str | os.PathLike[str], *, force: bo
     Arrow fields have unit and frame as metadata. The metadata `magtwin_readings` of the file hold, as JSON,
     the runs, the grid, the height and the source.
     """
-    fields, arrays = [], []
+    fields, arrays, parts = [], [], {**_PARTS, "signals": readings.signal_names}
     for key, (width, _) in SHAPES.items():
         values = getattr(readings, key)
         if values is None:
             continue
-        for i, part in enumerate(_parts(key, readings.signal_names) if width else ("",)):
+        for i, part in enumerate(parts[key] if width else ("",)):
             array = pa.array(np.ascontiguousarray(values[:, i] if width else values))
             texts = {"column": key, "part": part, "unit": _UNITS.get(key, ""), "frame": _FRAMES.get(key, "")}
             texts = {k: text for k, text in texts.items() if text}
@@ -56,11 +56,6 @@ def save_readings(readings: Readings, path: str | os.PathLike[str], *, force: bo
     table = pa.Table.from_arrays(arrays, schema=schema)
     with output(path, force=force) as aside:
         pq.write_table(table, aside, compression="zstd", use_dictionary=False, column_encoding=split)
-
-
-def _parts(key: str, signal_names: tuple[str, ...]) -> tuple[str, ...]:
-    """Parts of the columns of an array."""
-    return signal_names if key == "signals" else _PARTS[key]
 
 
 def load_readings(path: str | os.PathLike[str]) -> Readings:
@@ -88,9 +83,9 @@ def load_readings(path: str | os.PathLike[str]) -> Readings:
         ) from error
     names = set(table.names)
     arrays: dict[str, ArrayLike] = {}
+    parts = {**_PARTS, "signals": given["signal_names"]}
     for key, (width, kind) in SHAPES.items():
-        parts = _parts(key, given["signal_names"]) if width else ()
-        labels = [f"{key}_{part}" for part in parts] if width else [key]
+        labels = [f"{key}_{part}" for part in parts[key]] if width else [key]
         if names.isdisjoint(labels) and key in ("b_body_nt", "t", "signals", "node"):
             continue
         cells: list[NDArray[Any]] = [table.numbers(label).astype(kind) for label in labels]
