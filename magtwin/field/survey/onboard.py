@@ -23,9 +23,10 @@ FIELDS_NT: Mapping[str, float] = {
     "sin": 100.0,
 }
 # Signals without which a map of one drive has an unknown offset, and the columns of a Run that tell them
-NEEDED = {"friction": "wheel_angle", "lidar": "lidar_on", "current": "battery_a"}
+NEEDED = {"friction": "wheel_angle", "lidar": "lidar_on (at times off)", "current": "battery_a"}
 COLUMNS = ("wheel_angle", "lidar_on", "battery_a", "battery_v", "battery_fraction")  # Of a Run, for signals
 CREEP = 0.05  # Rate of a wheel below which its friction falls in proportion [rad/s]
+LEAST_REPORTS = 10  # Fewest reports of a battery that are fitted without the rows that hold them
 SMOOTH_S = 0.2  # Time over which rates and accelerations of wheels are measured [s]
 
 
@@ -57,7 +58,7 @@ def signals_of(t: Array, columns: Mapping[str, Array]) -> tuple[Array | None, tu
             signals[f"rate {side}"] = rate
             signals[f"acceleration {side}"] = slope(rate)
             signals[f"cos {side}"], signals[f"sin {side}"] = np.cos(angle), np.sin(angle)
-    if "lidar_on" in columns:
+    if "lidar_on" in columns and not columns["lidar_on"].all():  # always on, it is like hard iron
         signals["lidar"] = columns["lidar_on"]
     if "battery_a" in columns:
         signals["current"] = _current(columns, signals)
@@ -76,5 +77,7 @@ def _current(columns: Mapping[str, Array], signals: Mapping[str, Array]) -> Arra
     uses = np.column_stack([one, signals.get("lidar", 0 * one), sum(work, 0 * one)])
     charge = np.column_stack([one, columns.get("battery_fraction", one)])
     volt = np.linalg.lstsq(charge, volts, rcond=None)[0]
-    power = np.linalg.lstsq(uses, volts * columns["battery_a"], rcond=None)[0]
+    new = np.append(True, np.diff(columns["battery_a"]) != 0)  # what is held lags behind the LiDAR and wheels
+    new |= np.count_nonzero(new) < LEAST_REPORTS
+    power = np.linalg.lstsq(uses[new], (volts * columns["battery_a"])[new], rcond=None)[0]
     return np.asarray(uses @ power / (charge @ volt) - power[0] / max(volt.sum(), volts.min()))

@@ -51,6 +51,8 @@ def test_signals_are_zero_at_rest_and_the_current_is_that_above_a_full_packs():
         assert_allclose(found[f"cos {side}"], np.cos(known["wheel_angle"][:, 0]))
     assert np.sqrt(np.mean((found["current"] - current) ** 2)) < 0.1 * current.std()
     assert lacking(names) == []
+    always = signals_of(t, known | {"lidar_on": np.ones(len(t))})[1]
+    assert lacking(always) == ["lidar_on (at times off)"]
     assert signals_of(t[:1], known) == signals_of(t[::-1], known) == signals_of(t, {}) == (None, ())
     assert lacking(("lidar",)) == ["wheel_angle", "battery_a"]
     assert len(prior_sd_nt(names)) == len(names)
@@ -124,7 +126,7 @@ def test_what_the_signals_lack_stays_an_offset_and_is_named(drive):
     some = drive.with_(signals=drive.signals[:, :2], signal_names=drive.signal_names[:2])
     assert offset_sd_nt(some, some.signal_names) == offset_sd_nt(drive) == OFFSET_SD_NT
     assert offset_sd_nt(drive, drive.signal_names) == 0
-    assert "record lidar_on, battery_a with it" in _shared(some, "auto")[-1]
+    assert "record lidar_on (at times off), battery_a with it" in _shared(some, "auto")[-1]
     assert "take --method auto" in _shared(drive, "gp")[-1]
     assert not any("one drive" in doubt for doubt in _shared(drive, "auto"))
 
