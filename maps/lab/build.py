@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.field.fit.fit import fit, raster
-from magtwin.field.maps.map import AnomalyMap
+from magtwin.field.maps.map import NOISE, TABLED, AnomalyMap
 from magtwin.field.maps.scene_state import made_from
 from magtwin.field.survey.readings import Readings
 from magtwin.files.file import shipped
@@ -249,6 +249,7 @@ def lab_map(scene: Scene) -> AnomalyMap:
         values_nt=field.values_nt.astype(np.float32),
         variance_nt2=stepped(field.variance_nt2),
         between_nt2=stepped(field.between_nt2),
+        parameters={k: v for k, v in field.parameters.items() if k not in (NOISE, TABLED)},  # as released
         made_from=made_from(scene),
     )
 

@@ -103,7 +103,8 @@ def predict_readings(model: FieldModel, test: Readings, method: str) -> tuple[Ar
     yaw = test.yaw
     if test.grid is not None and test.node is not None and method in FILLED:
         yaw = np.asarray(test.grid.headings_rad)[test.node[:, 0]]
-    mean, variance = model.predict(test.p_xy, yaw)
+    given: dict[str, Any] = {"signals": test.signals} if getattr(model, "signals", ()) else {}
+    mean, variance = model.predict(test.p_xy, yaw, **given)
     return mean, variance + model.noise_nt2
 
 

@@ -5,7 +5,7 @@ twenty times as long. Whole headings run in parallel instead.
 """
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -16,13 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.compiled import threads
 from magtwin.errors import InputError, hint
 from magtwin.field.fit.methods import METHODS, FieldModel, MapMethod
-from magtwin.field.fit.resolution import resolution
+from magtwin.field.fit.resolution import GOLDEN, resolution
 from magtwin.field.grid import TURN, Grid
 from magtwin.field.maps.curvature import interpolation_error_nt2
-from magtwin.field.maps.map import OFFSET, AnomalyMap
+from magtwin.field.maps.map import NOISE, OFFSET, TABLED, AnomalyMap
 from magtwin.field.maps.statistics import offset_figures
 from magtwin.field.survey.axes import SurveyAxes, distinct, in_order, in_own_axes
 from magtwin.field.survey.bins import distance_m, spacing_m
+from magtwin.field.survey.onboard import lacking
 from magtwin.field.survey.readings import Readings, checked_earth_nt
 from magtwin.report.report import Figure, Report
 
@@ -38,6 +39,8 @@ ERRORS = ("error between nodes [nT]", "error between headings [nT]")
 # Standard deviation of what a robot adds alike throughout a drive [nT]: a constant of 500 and, by heading,
 # 400, as in drives of the shipped robot (`ROBOT_NOISE` of `magtwin.tasks.localizing`)
 OFFSET_SD_NT = 640.0
+TRIED = 2000  # Poses at which a map's table is compared with its model
+MOST_READ = 400  # Most readings of a drive at which the fields of its signals are averaged
 MOST_THREADS = 4  # Headings of a raster that are computed in parallel: each holds blocks of 100 MB
 
 
@@ -164,7 +167,7 @@ def raster(
             say(h, len(headings), "headings")
             values[h], variance[h] = predicted
     say(len(headings), len(headings), "headings")
-    offset = offset_sd_nt(readings)
+    offset = offset_sd_nt(readings, getattr(model, "signals", ()))
     valid = np.isfinite(values) & np.isfinite(variance) & _known(model, readings, own, p[0], variance)
     if not valid.any():
         x0, x1, y0, y1 = grid.extent
@@ -174,7 +177,7 @@ def raster(
             "theirs; mask readings that contradict each other"
         )
     read = model.method == "trilinear" and readings.grid is not None  # its nodes err independently
-    return AnomalyMap(
+    field = AnomalyMap(
         values_nt=values,
         valid=valid,
         variance_nt2=variance + offset**2 + readings.rounding_nt**2,
@@ -183,21 +186,49 @@ def raster(
         cell_m=grid.cell_m,
         headings_rad=np.asarray(grid.headings_rad),
         method=model.method,
-        parameters={**model.parameters, **errors, **({OFFSET: offset} if offset else {})},
+        parameters={
+            **model.parameters,
+            **errors,
+            **({OFFSET: offset} if offset else {}),
+            NOISE: round(float(np.sqrt(_noise_nt2(model, readings))), 2),
+        },
         **readings.about,
         harmonic=getattr(model, "field", None),
     )
+    return _with_greatest_error(field) if field.holds_model else field
 
 
-def offset_sd_nt(readings: Readings) -> float:
+def _with_greatest_error(field: AnomalyMap) -> AnomalyMap:
+    """The map with the greatest difference of its table from its model, at evenly spread poses."""
+    even = np.mod(0.5 + np.arange(1, TRIED + 1)[:, None] * GOLDEN, 1.0)
+    x0, x1, y0, y1 = field.extent
+    p, yaw = (x0, y0) + even[:, :2] * (x1 - x0, y1 - y0), TURN * even[:, 2]
+    error = np.abs(field.lookup(p, yaw) - field.exact(p, yaw))
+    known = error[np.isfinite(error)]
+    more = {TABLED: round(float(known.max()), 2)} if len(known) else {}
+    return replace(field, parameters={**field.parameters, **more})
+
+
+def offset_sd_nt(readings: Readings, signals: Collection[str] = ()) -> float:
     """Standard deviation of an error that is alike all over a map of the readings [nT].
 
     A robot that drives adds the fields of its motors, battery and LiDAR. What is alike throughout its only
-    drive cannot be told from the field of the room, and no reading of the drive disagrees with it. A
-    sensor carried by hand has no such error.
+    drive cannot be told from the field of the room, and no reading of the drive disagrees with it, unless
+    the fields of all its `signals` were fitted. A sensor carried by hand has no such error.
     """
     drive = readings.grid is None and readings.t is not None and not readings.by_hand
-    return OFFSET_SD_NT if drive and np.ptp(readings.run[readings.good]) == 0 else 0.0
+    open_ = drive and np.ptp(readings.run[readings.good]) == 0 and lacking(signals)
+    return OFFSET_SD_NT if open_ else 0.0
+
+
+def _noise_nt2(model: FieldModel, readings: Readings) -> float:
+    """Variance of a reading about the map [nT^2], with the fields of its robot's signals, if any."""
+    if not getattr(model, "signals", ()) or readings.signals is None:
+        return model.noise_nt2
+    rows = np.linspace(0, len(readings) - 1, min(len(readings), MOST_READ)).astype(np.intp)
+    p, yaw, signals = readings.p_xy[rows], readings.yaw[rows], readings.signals[rows]
+    own = model.predict(p, yaw, signals)[0] - model.predict(p, yaw)[0]  # type: ignore[call-arg]
+    return model.noise_nt2 + float(np.mean(own**2))
 
 
 def grid_report(field: AnomalyMap) -> Report:
@@ -214,6 +245,9 @@ def grid_report(field: AnomalyMap) -> Report:
     if field.variance_nt2 is not None and field.valid.any():
         sd = float(np.sqrt(np.median(field.variance_nt2[field.valid])))
         figures.append(Figure("standard deviation", round(sd, 1), "nT", note="median over the nodes"))
+    if TABLED in field.parameters:
+        note = "against the field of the fit, which the map holds (AnomalyMap.exact); of 2,000 poses"
+        figures.append(Figure("greatest error of interpolation", field.parameters[TABLED], "nT", note=note))
     figures += offset_figures(field)
     return Report("grid", tuple(figures), {})
 

@@ -26,7 +26,10 @@ Array = NDArray[np.float64]
 
 TEXTS = ("name", "method", "source", "licence", "created", "frame", "datum")  # Metadata that are texts
 CONSTANT_NT = 1e-3  # Range of values up to which a map is constant [nT]
-OFFSET = "offset sd [nT]"  # Parameter of a map: see `AnomalyMap.offset_sd_nt`
+# Parameters of a map: see `AnomalyMap.offset_sd_nt` and `AnomalyMap.noise_nt2`
+OFFSET, NOISE = "offset sd [nT]", "noise of a reading [nT]"
+TABLED = "greatest error of the table [nT]"  # Parameter of a map: see `AnomalyMap.exact`
+SINGLE_NT = 0.05  # Rounding of a field to single precision, with some margin [nT]
 
 Outside = Literal["nan", "clamp", "raise"]
 
@@ -193,13 +196,14 @@ class AnomalyMap(Summarized):
         return self._look(p_xy, yaw, outside, gradient=True)[:2]
 
     def lookup_with_sd(
-        self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan"
+        self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan", reading: bool = False
     ) -> tuple[Array, Array]:
         """Field at poses, as by `lookup`, and its standard deviation.
 
         That is the root of the interpolated variance of the nodes and, if `between_nt2` is known, of the
         error of linear interpolation between nodes and between headings. It is 0 at nodes, where only their
-        own variance is left. The reference is the field that the survey's robot reads at rest.
+        own variance is left. The reference is the field that the survey's robot reads at rest; with
+        `reading`, a reading like those of the survey, so that `noise_nt2` is added.
 
         Returns:
             Field magnitude and its standard deviation [nT], each of shape (...).
@@ -208,7 +212,7 @@ class AnomalyMap(Summarized):
             InputError: The map has no variance; or an error of `lookup`.
         """
         value, _, sd = self._look(p_xy, yaw, outside, gradient=False, sd=True)
-        return value, sd
+        return value, np.sqrt(sd**2 + self.noise_nt2) if reading else sd
 
     def lookup_all(
         self, p_xy: ArrayLike, yaw: ArrayLike, *, outside: Outside = "nan"
@@ -221,6 +225,32 @@ class AnomalyMap(Summarized):
         """
         value, slopes, sd = self._look(p_xy, yaw, outside, gradient=True, sd=True)
         return value, sd, slopes
+
+    def exact(self, p_xy: ArrayLike, yaw: ArrayLike) -> Array:
+        """Field at poses by the fitted field itself, smooth across nodes and headings [nT], shape (...).
+
+        It is known where `lookup` is. The nodes are a table of it, for speed: between them `lookup` differs
+        by at most the map's parameter `TABLED` at 2,000 poses that were tried.
+
+        Raises:
+            InputError: The map does not hold the field of its nodes (`holds_model`).
+        """
+        if self.harmonic is None or not self.holds_model:
+            text = "does not hold the field that its values are of; fit it with `method='harmonic'`"
+            raise InputError(f"map {self.name!r} {text}, or use lookup")
+        tabled = self.lookup(p_xy, yaw)
+        return np.where(np.isnan(tabled), np.nan, self.harmonic.magnitude_nt(p_xy, yaw, compiled=True))
+
+    @cached_property
+    def holds_model(self) -> bool:
+        """Whether the values of the nodes are those of `harmonic`, in single precision."""
+        nodes = np.argwhere(self.valid)[:: max(1, self.known.nodes // 100)]
+        if self.harmonic is None or not len(nodes):
+            return False
+        p, yaw = self.grid.poses()
+        h, j, i = nodes.T
+        off = self.harmonic.magnitude_nt(p[0][j, i], yaw[h, 0, 0]) - self.values_nt[h, j, i]
+        return bool(np.abs(off).max() < SINGLE_NT)
 
     def mean(self, p_xy: ArrayLike, yaw: ArrayLike) -> Array:
         """Same as `lookup`; with `gradient` and `variance` the map is a belief of the field."""
@@ -307,7 +337,15 @@ class AnomalyMap(Summarized):
     @property
     def offset_sd_nt(self) -> float:
         """Standard deviation of an error that is alike all over the map [nT]; part of every variance."""
-        known = self.parameters.get(OFFSET)
+        return self._parameter(OFFSET)
+
+    @property
+    def noise_nt2(self) -> float:
+        """Variance of a reading of the survey about the map [nT^2], as its fit estimates it; 0 if unknown."""
+        return self._parameter(NOISE) ** 2
+
+    def _parameter(self, name: str) -> float:
+        known = self.parameters.get(name)
         return float(known) if isinstance(known, int | float) and 0 < known < np.inf else 0.0
 
     def relative(self) -> "AnomalyMap":

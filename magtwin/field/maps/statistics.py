@@ -87,11 +87,15 @@ def map_metadata(field: AnomalyMap) -> Report:
 
 
 def offset_figures(field: AnomalyMap) -> list[Figure]:
-    """The offset that a map of one drive leaves open; none for other maps."""
+    """The noise of readings about a map, and the offset that a map of one drive leaves open, if known."""
+    noise = []
+    if field.noise_nt2:
+        note = "of a reading about the map; not part of the standard deviation"
+        noise.append(Figure("noise", round(field.noise_nt2**0.5, 1), "nT", note=note))
     if not field.offset_sd_nt:
-        return []
+        return noise
     note = "part of it: one drive cannot tell what its robot adds alike throughout from the room's field"
-    return [Figure("offset sd", field.offset_sd_nt, "nT", note=note)]
+    return [*noise, Figure("offset sd", field.offset_sd_nt, "nT", note=note)]
 
 
 def source_files(source: str) -> dict[str, str]:

@@ -82,12 +82,19 @@ class HarmonicField(Summarized):
         return sums(p_world, self.p_world_dipole, self.m_world) + self.b_uniform_nt
 
     def magnitude_nt(
-        self, p_xy: ArrayLike, yaw: ArrayLike, *, height_m: float | None = None, compiled: bool = False
+        self,
+        p_xy: ArrayLike,
+        yaw: ArrayLike,
+        *,
+        height_m: float | None = None,
+        own_nt: ArrayLike = 0.0,
+        compiled: bool = False,
     ) -> Array:
         """What the survey's robot reads at rest at a pose.
 
         Positions of base_link [m], shape (..., 2), and headings [rad], shape (...), are broadcast; the height
-        of the sensor above the floor [m] is by default the survey's. Field magnitude [nT], shape (...).
+        of the sensor above the floor [m] is by default the survey's. `own_nt` (..., 3) is what the robot adds
+        to its hard iron, such as by motors. Field magnitude [nT], shape (...).
         """
         p, yaw = np.asarray(p_xy, float), np.asarray(yaw, float)
         shape = np.broadcast_shapes(p.shape[:-1], yaw.shape)
@@ -96,4 +103,5 @@ class HarmonicField(Summarized):
         at = rotate(turn, np.broadcast_to(place, (*shape, 3)))
         at[..., :2] += p
         b = rotate(quat_conjugate(turn), self.field_nt(at, compiled=compiled))
-        return np.asarray(np.linalg.norm(b + b @ self.soft_iron.T + self.hard_iron_nt, axis=-1))
+        own = np.asarray(own_nt) + self.hard_iron_nt
+        return np.asarray(np.linalg.norm(b + b @ self.soft_iron.T + own, axis=-1))

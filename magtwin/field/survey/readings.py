@@ -32,6 +32,9 @@ class Readings(Summarized):
     run: NDArray[np.intp] = None  # type: ignore[assignment]
     runs: tuple[str, ...] = ("",)  # Names of the runs or files that the rows come from
     t: Array | None = None  # Time of each row in its run [s], shape (N,); None if unknown
+    # What the robot did at each row, 0 where it stood with its LiDAR off, shape (N, K), see `onboard`
+    signals: Array | None = None
+    signal_names: tuple[str, ...] = ()  # Names of the signals
     # Rows that are field, not a stuck sensor, shape (N,). Default: all.
     good: NDArray[np.bool_] = None  # type: ignore[assignment]
     grid: Grid | None = None  # Nodes of a gridded survey; None for a scattered one
@@ -68,6 +71,7 @@ class Readings(Summarized):
             if given is None:
                 continue
             array: NDArray[Any] = np.array(given, kind)
+            columns = len(self.signal_names) if name == "signals" else columns
             shape = (n, columns) if columns else (n,)
             if array.shape != shape:
                 raise InputError(f"{name} of Readings must have shape {shape}, got {array.shape}")
@@ -154,6 +158,7 @@ class Readings(Summarized):
                 ("field", f"{span(good.min(), good.max(), 'nT')}, mean {good.mean():,.0f} nT{vectors}"),
                 ("runs", f"{len(self.runs):,}: {listed(self.runs)}" if any(self.runs) else ""),
                 ("known", ", ".join(about)),
+                ("signals", listed(self.signal_names)),
                 ("source", self.source),
             ),
         )
@@ -192,6 +197,7 @@ SHAPES: dict[str, tuple[int, type]] = {
     "b_body_nt": (3, float),
     "run": (0, np.intp),
     "t": (0, float),
+    "signals": (-1, float),
     "good": (0, bool),
     "node": (3, np.intp),
 }

@@ -33,12 +33,12 @@ def save_readings(readings: Readings, path: str | os.PathLike[str], *, force: bo
     Arrow fields have unit and frame as metadata. The metadata `magtwin_readings` of the file hold, as JSON,
     the runs, the grid, the height and the source.
     """
-    fields, arrays = [], []
+    fields, arrays, parts = [], [], {**_PARTS, "signals": readings.signal_names}
     for key, (width, _) in SHAPES.items():
         values = getattr(readings, key)
         if values is None:
             continue
-        for i, part in enumerate(_PARTS[key] if width else ("",)):
+        for i, part in enumerate(parts[key] if width else ("",)):
             array = pa.array(np.ascontiguousarray(values[:, i] if width else values))
             texts = {"column": key, "part": part, "unit": _UNITS.get(key, ""), "frame": _FRAMES.get(key, "")}
             texts = {k: text for k, text in texts.items() if text}
@@ -47,6 +47,7 @@ def save_readings(readings: Readings, path: str | os.PathLike[str], *, force: bo
             arrays.append(array)
     about: dict[str, Any] = {key: getattr(readings, key) for key in (*_TEXTS, *_PLACES)}
     about |= {"runs": readings.runs, "height_m": readings.height_m, "earth_nt": readings.earth_nt}
+    about |= {"signal_names": readings.signal_names} if readings.signal_names else {}
     about |= {"by_hand": True} if readings.by_hand else {}
     about |= {"rounding_nt": readings.rounding_nt} if readings.rounding_nt else {}
     about["grid"] = None if readings.grid is None else asdict(readings.grid)
@@ -72,6 +73,7 @@ def load_readings(path: str | os.PathLike[str]) -> Readings:
         )
         given = {key: about[key] for key in (*_TEXTS, "height_m")} | {"runs": tuple(about["runs"])}
         given |= {key: about.get(key, "") for key in _PLACES} | {"earth_nt": about.get("earth_nt")}
+        given["signal_names"] = tuple(map(str, about.get("signal_names", ())))
         given |= {"by_hand": about.get("by_hand") is True, "rounding_nt": about.get("rounding_nt", 0.0)}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         if isinstance(error, InputError):
@@ -81,9 +83,10 @@ def load_readings(path: str | os.PathLike[str]) -> Readings:
         ) from error
     names = set(table.names)
     arrays: dict[str, ArrayLike] = {}
+    parts = {**_PARTS, "signals": given["signal_names"]}
     for key, (width, kind) in SHAPES.items():
-        labels = [f"{key}_{part}" for part in _PARTS[key]] if width else [key]
-        if names.isdisjoint(labels) and key in ("b_body_nt", "t", "node"):
+        labels = [f"{key}_{part}" for part in parts[key]] if width else [key]
+        if names.isdisjoint(labels) and key in ("b_body_nt", "t", "signals", "node"):
             continue
         cells: list[NDArray[Any]] = [table.numbers(label).astype(kind) for label in labels]
         arrays[key] = np.column_stack(cells) if width else cells[0]

@@ -192,6 +192,7 @@ def _shared(readings: Readings, method: str) -> list[str]:
     """What a fit takes for granted about the runs of a survey, and what its intervals leave out."""
     from magtwin.field.fit.fit import offset_sd_nt
     from magtwin.field.fit.passes import by_pass
+    from magtwin.field.survey.onboard import lacking
 
     doubts = list[str]()
     if readings.grid is not None:
@@ -207,13 +208,16 @@ def _shared(readings: Readings, method: str) -> list[str]:
             "the drive never comes back to a place, so the noise between passes is unknown and the standard "
             "deviations are too small; cross your own path often"
         )
-    if offset := offset_sd_nt(readings):
+    used = readings.signal_names if method in ("auto", "harmonic") else ()
+    if offset := offset_sd_nt(readings, used):
+        columns = ", ".join(lacking(readings.signal_names))
+        way = f"record {columns} with it" if columns else "take --method auto, which fits them"
         doubts.append(
             "one drive: what its robot adds alike throughout (motors, battery, LiDAR) cannot be told from "
             f"the room's field; the standard deviations hold {offset:g} nT for it (offset sd), which "
-            "localization takes for an unknown bias; survey at rest, node by node, for a smaller one"
+            f"localization takes for an unknown bias; {way}, or survey at rest, node by node"
         )
-    elif readings.t is not None and not readings.by_hand:
+    elif readings.t is not None and not readings.by_hand and np.ptp(readings.run[readings.good]):
         doubts.append(
             "readings of drives: the standard deviations do not hold what the robot adds alike in all runs "
             "(motors, battery, LiDAR); survey at rest, node by node, for intervals that hold"

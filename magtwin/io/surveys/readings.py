@@ -14,6 +14,7 @@ import numpy as np
 
 from magtwin.errors import InputError
 from magtwin.field.survey.folder import read_grid
+from magtwin.field.survey.onboard import COLUMNS, signals_of
 from magtwin.field.survey.readings import TAKEN, Readings
 from magtwin.field.survey.saved import load_readings
 from magtwin.files.file import existing, sha256
@@ -110,7 +111,11 @@ def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
         if "b_vector_measured_nt" in run:
             vector = levelled(run["b_vector_measured_nt"], run["q_world_base_xyzw"], "body")
             known &= np.isfinite(vector).all(axis=1)
+    told = {name: run[name][known].astype(float) for name in COLUMNS if name in run}
+    signals, names = signals_of(t[known], {name: c for name, c in told.items() if np.isfinite(c).all()})
     return Readings(
+        signals=signals,
+        signal_names=names,
         p_xy=p[known, :2],
         yaw=yaw[known],
         b_nt=b[known],
@@ -196,10 +201,12 @@ def _together(parts: Sequence[Readings]) -> Readings:
         raise InputError(f"survey {gridded[0]!r} {text}")
     first = np.cumsum([0] + [len(part.runs) for part in parts])
     arrays: dict[str, Any] = {"run": np.concatenate([p.run + n for p, n in zip(parts, first, strict=False)])}
-    for key in ("p_xy", "yaw", "b_nt", "b_body_nt", "t", "good"):
+    alike = all(part.signal_names == parts[0].signal_names for part in parts)
+    parts = parts if alike else [p.with_(signals=None, signal_names=()) for p in parts]
+    same: dict[str, Any] = {"signal_names": parts[0].signal_names}
+    for key in ("p_xy", "yaw", "b_nt", "b_body_nt", "t", "signals", "good"):
         values = [getattr(part, key) for part in parts]
         arrays[key] = None if any(v is None for v in values) else np.concatenate(values)
-    same: dict[str, Any] = {}
     unknown = {"created": "", "frame": "", "datum": "", "height_m": None, "earth_nt": None}
     for key, default in unknown.items():
         values_of = {getattr(part, key) for part in parts}

@@ -7,13 +7,15 @@ from numpy.testing import assert_allclose
 from magtwin.field.fit.harmonic.forward import Forward
 
 P, YAW = np.array([[0.2, -0.1], [-0.7, 0.4], [0.5, 0.6]]), np.array([0.3, 2.0, -1.2])
+SIGNALS = np.array([[1.0, -0.3], [0.0, 2.0], [0.5, 0.1]])
 
 
-def some():
+def some(signals=0):
     rng = np.random.default_rng(0)
-    forward = Forward(rng.uniform((-1, -1, -0.9), (1, 1, -0.3), (6, 3)), 0.2)
+    forward = Forward(rng.uniform((-1, -1, -0.9), (1, 1, -0.3), (6, 3)), 0.2, signals=signals)
     unknowns = rng.normal(size=forward.size)
-    unknowns[18:] = [-2e3, 2.4e4, -3.8e4, 300, -200, 500, *(0.02 * rng.normal(size=8)), 0.03, -0.02]
+    unknowns[18:34] = [-2e3, 2.4e4, -3.8e4, 300, -200, 500, *(0.02 * rng.normal(size=8)), 0.03, -0.02]
+    unknowns[34:] *= 300
     return forward, unknowns
 
 
@@ -25,16 +27,24 @@ def test_magnitudes_are_those_of_the_harmonic_field():
     assert_allclose(np.linalg.norm(vectors, axis=1), read.values_nt[:, 0], rtol=1e-12)
 
 
+def test_a_signal_adds_its_field_in_the_robots_axes():
+    forward, unknowns = some(signals=2)
+    still = forward.read(unknowns, P, YAW, vectors=True).values_nt
+    moving = forward.read(unknowns, P, YAW, SIGNALS, vectors=True).values_nt
+    assert_allclose(moving - still, SIGNALS @ unknowns[34:].reshape(2, 3), atol=1e-9)
+
+
 @pytest.mark.parametrize("vectors", [False, True])
-def test_derivatives_are_those_by_finite_differences(vectors):
-    forward, unknowns = some()
-    read = forward.read(unknowns, P, YAW, vectors=vectors)
+@pytest.mark.parametrize("signals", [None, SIGNALS])
+def test_derivatives_are_those_by_finite_differences(vectors, signals):
+    forward, unknowns = some(signals=0 if signals is None else 2)
+    read = forward.read(unknowns, P, YAW, signals, vectors=vectors)
 
     def slope(change, step):
         return (change(step) - change(-step)) / (2 * step)
 
     def value(u, p=P, yaw=YAW):
-        return forward.read(u, p, yaw, vectors=vectors).values_nt
+        return forward.read(u, p, yaw, signals, vectors=vectors).values_nt
 
     for k, unit in enumerate(np.eye(forward.size)):
         step = 1e-5 * max(1.0, abs(unknowns[k]))

@@ -30,10 +30,14 @@ def test_both_forms_are_the_textbooks(shape):
 def test_groups_left_out_are_as_if_they_had_never_been_read(shape):
     rows, target = problem(*shape)
     groups = [np.array([0, 3]), np.array([1]), np.array([2, *range(4, shape[0])])]
-    error, variance = Posterior.of(rows).left_out(target, groups)
-    for group in groups:
+    whole = Posterior.of(rows)
+    error, variance = whole.left_out(target, groups)
+    lost = whole.changes(target, groups)
+    for k, group in enumerate(groups):
         kept = np.setdiff1d(np.arange(shape[0]), group)
         covariance = np.linalg.inv(rows[kept].T @ rows[kept] + np.eye(shape[1]))
-        want = target[group] - rows[group] @ covariance @ rows[kept].T @ target[kept]
+        without = covariance @ rows[kept].T @ target[kept]
+        assert_allclose(lost[:, k], whole.mean(target) - without, rtol=1e-8, atol=1e-10)
+        want = target[group] - rows[group] @ without
         assert_allclose(error[group], want, rtol=1e-9, atol=1e-10)
         assert_allclose(variance[group], np.diag(rows[group] @ covariance @ rows[group].T), rtol=1e-8)

@@ -38,22 +38,23 @@ class Forward:
     """Dipoles, a uniform field and a platform; the sensor moves in the plane at `height_m`.
 
     The unknowns are, in order, the moments, dipole by dipole (3 D), the uniform field B_0 (3) and the
-    platform's h, S and l (`PLATFORM`).
+    platform's h, S and l (`PLATFORM`), and the field per unit of each signal, in base_link axes (3 K).
     """
 
     p_world_dipole: Array  # Dipole positions [m], shape (D, 3)
     height_m: float  # Height of the sensor [m]
     # Trace of the soft iron, if it is known: no unknown has a part in it, see `SOFT`
     soft_iron_trace: float = 0.0
+    signals: int = 0  # Number of signals of the robot, each with a field along three axes
 
     @property
     def size(self) -> int:
         """Number of unknowns."""
-        return 3 * len(self.p_world_dipole) + 3 + PLATFORM
+        return 3 * (len(self.p_world_dipole) + 1 + self.signals) + PLATFORM
 
     def field(self, unknowns: Array) -> HarmonicField:
         """The unknowns as a field with its platform."""
-        m, uniform, hard, soft, lever = self._parts(unknowns)
+        m, uniform, hard, soft, lever, _ = self._parts(unknowns)
         return HarmonicField(
             p_world_dipole=self.p_world_dipole,
             m_world=m,
@@ -71,12 +72,15 @@ class Forward:
         jacobian[:, :, count : count + 3] = np.eye(3)
         return jacobian
 
-    def read(self, unknowns: Array, p_xy: Array, yaw: Array, *, vectors: bool) -> Reading:
+    def read(
+        self, unknowns: Array, p_xy: Array, yaw: Array, signals: Array | None = None, *, vectors: bool
+    ) -> Reading:
         """What the robot reads at poses of base_link, with all derivatives.
 
-        The unknowns have shape (P,). With `vectors`, it reads them in base_link axes, otherwise magnitudes.
+        The unknowns have shape (P,), the signals (N, K); without signals it stands with its LiDAR off. With
+        `vectors`, it reads them in base_link axes, otherwise magnitudes.
         """
-        m, uniform, hard, soft, lever = self._parts(unknowns)
+        m, uniform, hard, soft, lever, own = self._parts(unknowns)
         turn, swing = _turns(yaw)
         at = np.column_stack([p_xy + turn[:, :2, :2] @ lever, np.full(len(p_xy), self.height_m)])
         b, slope = dipole_field_and_gradient_nt(at, self.p_world_dipole, m)
@@ -84,6 +88,8 @@ class Forward:
         whole = np.eye(3) + soft
         base = np.einsum("nji,nj->ni", turn, b)
         inner = base @ whole.T + hard
+        if signals is not None:
+            inner += signals @ own
         out = np.broadcast_to(np.eye(3), (len(b), 3, 3))
         if not vectors:
             size = np.linalg.norm(inner, axis=1)
@@ -99,12 +105,16 @@ class Forward:
         jacobian[:, :, count : count + 3] = world
         jacobian[:, :, count + 3 : count + 6] = out
         jacobian[:, :, count + 6 : count + 14] = np.einsum("nci,kij,nj->nck", out, SOFT, base, optimize=True)
-        jacobian[:, :, count + 14 :] = by_place[:, :, :2] @ turn[:, :2, :2]
+        jacobian[:, :, count + 14 : count + 16] = by_place[:, :, :2] @ turn[:, :2, :2]
+        jacobian[:, :, count + 16 :] = 0.0
+        if signals is not None:
+            each = jacobian[:, :, count + 16 :].reshape(len(b), parts, self.signals, 3)
+            each[:] = signals[:, None, :, None] * out[:, :, None, :]
         values = inner if vectors else size[:, None]
         by_yaw = np.einsum("nci,ni->nc", rows, turned + carried)
         return Reading(values, jacobian, by_place[:, :, :2], by_yaw)
 
-    def _parts(self, unknowns: Array) -> tuple[Array, Array, Array, Array, Array]:
+    def _parts(self, unknowns: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
         count = 3 * len(self.p_world_dipole)
         rest = unknowns[count:]
         return (
@@ -112,7 +122,8 @@ class Forward:
             rest[:3],
             rest[3:6],
             np.tensordot(rest[6:14], SOFT, 1) + self.soft_iron_trace / 3 * np.eye(3),
-            rest[14:],
+            rest[14:16],
+            rest[16:].reshape(-1, 3),
         )
 
 

@@ -41,6 +41,7 @@ Known = tuple[Layers, Hyperparameters, Array]  # An earlier fit: its layers, hyp
 LEAST_READINGS = 8
 ROUNDS = 30  # Most rounds of learning
 LAYERWISE = 4  # First rounds, in which a layer has one strength
+SETTLING = 8  # The same from each start, if the readings have signals: their fields settle more slowly
 # Change of the logarithms of hyperparameters in a round (of strengths, in the mean) at which learning ends
 STILL = 0.03
 # Gain of the log evidence in a round below which learning from an earlier fit ends: less is no strong
@@ -114,7 +115,9 @@ def fit_harmonic(
     fits = list[Solution]()
     for k, depths in enumerate(tries):
         problem = Problem.of(good, layers_below(good, depths, height, most_dipoles), height, earth, platform)
-        begins = [fits[0].uniform] if fits else problem.begins
+        begins: Any = [fits[0].uniform] if fits else problem.begins
+        if fits and problem.signals is not None:
+            begins = fits[0].problem.layers, fits[0].figures, fits[0].unknowns
         fits.append(_solve(problem, known or begins, least, progress, k, len(tries)))
     return max(fits, key=Solution.evidence).model(good)
 
@@ -149,8 +152,9 @@ def _solve(
     With an earlier fit to begin with, continue from that.
     """
     begins, like = (begin, None) if isinstance(begin, list) else ([], begin)
+    settling = LAYERWISE if problem.signals is None else SETTLING
     tried = len(begins) if len(begins) > 1 else 0
-    total = tried * (1 + LAYERWISE) + ROUNDS
+    total = tried * (1 + settling) + ROUNDS
 
     def report(done: int) -> None:
         if progress is not None:
@@ -160,8 +164,8 @@ def _solve(
     begun = []
     for k, uniform in enumerate(begins):
         solution = Solution.start(problem, problem.first(), uniform)
-        for step in range(LAYERWISE if tried else 0):
-            report(k * (1 + LAYERWISE) + step + 1)
+        for step in range(settling if tried else 0):
+            report(k * (1 + settling) + step + 1)
             solution = solution.learnt(
                 None, step=False
             ).step()  # the starts are compared where they have settled

@@ -41,23 +41,27 @@ class HarmonicModel(FittedModel):
     # Information of the readings: in units of `prior_sd` the posterior covariance is 1 - learnt learnt^T,
     # shape (P, K)
     learnt: Array
-
+    # Spread of the unknowns, in units of `prior_sd`, between fits without a stretch of the drive each, by the
+    # block jackknife (Efron & Tibshirani 1993, section 11.5), shape (P, G): G is 0 if no signals of the robot
+    # are fitted. What their fields lack, such as a delay, is no noise, and differs between stretches.
+    spread: Array
     width: float  # Factor of the posterior variance where it is large against the noise, see `widened`
     headings_rad: Array  # Surveyed headings, ascending, if they are few and far apart; else empty, shape (H,)
     # Added variance between these headings, over (d g)^2 with the angles d and g to the two beside, estimated
     # from headings left out in turn [nT^2/rad^4]. Few headings determine it loosely: of the APRILab survey's
     # four, each left out, 73 % of the readings lie in the 90 % intervals from the other three.
     turned: float
+    signals: tuple[str, ...] = ()  # Names of the signals of the robot whose fields were fitted
     untold: str = ""  # Why the vector field is unknown; "" if it is known
     method: str = "harmonic"  # Name of the method
     axes: SurveyAxes = WORLD  # Axes of `forward`, `layers`, `unknowns`, `prior_sd`, `learnt`, `headings_rad`
 
-    def predict(self, p_xy: ArrayLike, yaw: ArrayLike) -> tuple[Array, Array]:
+    def predict(self, p_xy: ArrayLike, yaw: ArrayLike, signals: Array | None = None) -> tuple[Array, Array]:
         """Field magnitude as the survey's robot reads it [nT], and its variance without noise [nT^2]. See
-        `FieldModel`.
+        `FieldModel`. Without signals (N, K) of its drive, the robot stands with its LiDAR off.
         """
         p, yaw, shape = self.own_poses(p_xy, yaw)
-        value, variance = self._read(p, yaw)
+        value, variance = self._read(p, yaw, signals)
         return value.reshape(shape), self._corrected(variance, yaw).reshape(shape)
 
     def placed(self, axes: SurveyAxes) -> "HarmonicModel":
@@ -131,12 +135,13 @@ class HarmonicModel(FittedModel):
             flat[part] = VECTOR_WIDTH * self._variance(rows.reshape(-1, rows.shape[-1])).reshape(-1, 3)
         return value, variance
 
-    def _read(self, p: Array, yaw: Array) -> tuple[Array, Array]:
+    def _read(self, p: Array, yaw: Array, signals: Array | None = None) -> tuple[Array, Array]:
         """Magnitude [nT] and its posterior variance [nT^2] at poses (N, 2), (N,)."""
         value, variance = np.empty(len(p)), np.empty(len(p))
         for start in range(0, len(p), BLOCK):
             part = slice(start, start + BLOCK)
-            read = self.forward.read(self.unknowns, p[part], yaw[part], vectors=False)
+            some = None if signals is None else signals[part]
+            read = self.forward.read(self.unknowns, p[part], yaw[part], some, vectors=False)
             value[part], variance[part] = read.values_nt[:, 0], self._variance(read.jacobian[:, 0])
         return value, variance
 
@@ -147,8 +152,9 @@ class HarmonicModel(FittedModel):
     def _variance(self, jacobian: Array) -> Array:
         """Posterior variances of linear functions `jacobian` (N, P) of the unknowns, shape (N,)."""
         scaled = jacobian * self.prior_sd
-        known = scaled @ self.learnt
+        known, apart = scaled @ self.learnt, scaled @ self.spread
         left = np.einsum("np,np->n", scaled, scaled) - np.einsum("nk,nk->n", known, known)
+        left += np.einsum("ng,ng->n", apart, apart)
         return np.asarray(np.maximum(left, 0))
 
 

@@ -73,6 +73,18 @@ class Posterior:
             field[group] = np.maximum(np.diag(covariance) - 1, 0)
         return error, field
 
+    def changes(self, target: Array, groups: Sequence[NDArray[np.intp]]) -> Array:
+        """What the most likely unknowns lose with each group of readings, in closed form, (P, groups)."""
+        from scipy.linalg import cho_solve
+
+        error, _ = self.left_out(target, groups)
+        each = np.zeros((len(target), len(groups)))
+        for k, group in enumerate(groups):
+            each[group, k] = error[group]
+        if self.dual:
+            return np.asarray(self.rows.T @ cho_solve((self.lower, True), each))
+        return np.asarray(cho_solve((self.lower, True), self.rows.T @ each))
+
     def directions(self) -> Array:
         """Information on the unknowns as columns (P, K): their covariance is 1 - columns columns^T.
 

@@ -10,6 +10,7 @@ from magtwin.field.fit.harmonic.forward import SOFT, Forward, Reading
 from magtwin.field.fit.harmonic.layers import DEPTH_SPACINGS, Layers
 from magtwin.field.fit.passes import by_pass
 from magtwin.field.survey.bins import means
+from magtwin.field.survey.onboard import prior_sd_nt
 from magtwin.field.survey.readings import Readings
 
 Array = NDArray[np.float64]
@@ -23,6 +24,7 @@ EARTH_SD_NT = 1000.0  # Prior standard deviation of the uniform field about the 
 HARD_IRON_SD_NT, SOFT_IRON_SD, LEVER_SD_M = 3000.0, 0.03, 0.05
 # Length of the headings' mean vector from which they count as one: a spread of at most 8 deg
 ONE_HEADING = 0.99
+STRETCHES = 10  # Parts of a drive that a jackknife leaves out in turn
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,6 +78,7 @@ class Problem:
     p_xy: Array
     yaw: Array
     read_nt: Array  # (N, C)
+    signals: Array | None  # (N, K)
     cell: NDArray[np.intp]  # of each good reading
     passes: NDArray[np.intp] | None  # pass of each row of a drive, (N,); None if rows are not parts of one
     mean: Array  # of the unknowns' priors
@@ -104,6 +107,7 @@ class Problem:
         read = np.column_stack([mean(part) for part in read.T])
         p = np.column_stack([mean(good.p_xy[:, 0]), mean(good.p_xy[:, 1])])
         yaw = np.arctan2(mean(np.sin(good.yaw)), mean(np.cos(good.yaw)))
+        signals = None if good.signals is None else np.column_stack([mean(s) for s in good.signals.T])
         typical = float(np.median(good.b_nt))
         uniform, sd = np.array([0.0, 0.0, -typical]), typical / 2
         level, down = typical * np.cos(BEGUN_DIP), typical * np.sin(BEGUN_DIP)
@@ -118,7 +122,7 @@ class Problem:
             uniform = np.array([part.mean() for part in turned])
             begins = [uniform]
         trace = 0.0 if platform is None else float(np.trace(platform.soft_iron))
-        forward = Forward(layers.p_world_dipole, height, trace)
+        forward = Forward(layers.p_world_dipole, height, trace, len(good.signal_names))
         prior = np.zeros(forward.size)
         count = 3 * len(layers.p_world_dipole)
         prior[count : count + 3] = uniform
@@ -131,8 +135,9 @@ class Problem:
                 SOFT**2, (1, 2)
             )
             rest[3:14] = 0.0
+        rest = np.append(rest, np.repeat(prior_sd_nt(good.signal_names), 3))
         untold = UNTOLD if platform is None and good.b_body_nt is None else ""
-        return cls(forward, layers, p, yaw, read, cell, passes, prior, rest, begins, untold)
+        return cls(forward, layers, p, yaw, read, signals, cell, passes, prior, rest, begins, untold)
 
     @property
     def vectors(self) -> bool:
@@ -145,6 +150,12 @@ class Problem:
         square = np.floor(self.p_xy / side + 0.5).astype(np.int64)
         _, place = np.unique(square, axis=0, return_inverse=True)
         return self._grouped(place.ravel())
+
+    def stretches(self) -> list[NDArray[np.intp]]:
+        """Rows of reading components of `STRETCHES` parts of a drive; none if rows are not parts of one."""
+        if self.passes is None or len(self.passes) < 2 * STRETCHES:
+            return []
+        return self._grouped(np.arange(len(self.passes)) * STRETCHES // len(self.passes))
 
     def met(self) -> tuple[list[NDArray[np.intp]], NDArray[np.bool_]]:
         """Rows of reading components of each pass, and the rows within a spacing of another pass, (R,).
@@ -173,7 +184,7 @@ class Problem:
 
     def at(self, unknowns: Array) -> Reading:
         """Predictions for every row, with derivatives."""
-        return self.forward.read(unknowns, self.p_xy, self.yaw, vectors=self.vectors)
+        return self.forward.read(unknowns, self.p_xy, self.yaw, self.signals, vectors=self.vectors)
 
     def first(self) -> Hyperparameters:
         """Initial hyperparameters: strengths that give the field's spread, and small noises."""

@@ -236,10 +236,14 @@ class Solution:
         learnt, (louder, width) = posterior.directions(), self._calibrated(posterior, precision)
         headings, turned = self._turned(posterior, precision)
         field = problem.forward.field(self.unknowns)
-        slopes = problem.forward.read(self.unknowns, problem.p_xy, problem.yaw, vectors=False)
+        slopes = problem.forward.read(
+            self.unknowns, problem.p_xy, problem.yaw, problem.signals, vectors=False
+        )
         wide = figures.freedom / (figures.freedom - 2)
         noise = louder * wide * float(np.mean(figures.variance(slopes)))
-        off = good.b_nt - field.magnitude_nt(good.p_xy, good.yaw)
+        each = self.unknowns[len(self.unknowns) - 3 * len(good.signal_names) :].reshape(-1, 3)
+        own = 0.0 if good.signals is None else good.signals @ each
+        off = good.b_nt - field.magnitude_nt(good.p_xy, good.yaw, own_nt=own)
         within = off - (np.bincount(problem.cell, off) / np.bincount(problem.cell))[problem.cell]
         noise += float(np.mean(within**2))
         parameters = self._parameters(learnt, width, len(good))
@@ -258,9 +262,11 @@ class Solution:
             unknowns=self.unknowns,
             prior_sd=self.prior_sd,
             learnt=learnt,
+            spread=self._jackknife(posterior, precision),
             width=width,
             headings_rad=headings,
             turned=turned,
+            signals=good.signal_names,
             untold=problem.untold,
         )
 
@@ -296,6 +302,13 @@ class Solution:
         wider = max(tail_of(square[near] / variance[near], share[near]), 1.0)
         return louder * wider, width * wider
 
+    def _jackknife(self, posterior: Posterior, precision: Array) -> Array:
+        """See `HarmonicModel.spread`."""
+        groups = self.problem.stretches() if self.problem.signals is not None else []
+        changes = posterior.changes(self._target(posterior, precision), groups)
+        share = np.sqrt((len(groups) - 1) / len(groups)) if groups else 0.0
+        return np.asarray(share * (changes - changes.mean(axis=1, keepdims=True) if groups else changes))
+
     def _turned(self, posterior: Posterior, precision: Array) -> tuple[Array, float]:
         """See `HarmonicModel.headings_rad` and `HarmonicModel.turned`."""
         from scipy.special import stdtrit
@@ -319,7 +332,7 @@ class Solution:
         last = learnt[-len(problem.rest_sd) :]
         sd = problem.rest_sd * np.sqrt(np.maximum(1 - np.sum(last**2, axis=1), 0))
         field = problem.forward.field(self.unknowns)
-        uniform, hard, _, lever = np.split(self.unknowns[-len(problem.rest_sd) :], [3, 6, 14])
+        uniform, hard, _, lever, _ = np.split(self.unknowns[-len(problem.rest_sd) :], [3, 6, 14, 16])
         layers = problem.layers
         square = figures.strength**2 / layers.area_m2
         density = [float(np.sqrt(square[layers.layer == k].mean())) for k in range(len(layers.depths))]
@@ -341,7 +354,7 @@ class Solution:
             "soft iron": np.round(field.soft_iron.ravel(), 5).tolist(),
             "soft iron, sd": np.round(np.sqrt(np.tensordot(sd[6:14] ** 2, SOFT**2, 1)).ravel(), 5).tolist(),
             "lever arm [m]": np.round(lever, 5).tolist(),
-            "lever arm, sd [m]": np.round(sd[14:], 5).tolist(),
+            "lever arm, sd [m]": np.round(sd[14:16], 5).tolist(),
             "width of variances": round(width, 4),
             "log evidence": round(self.evidence(), 2),
         }
