@@ -15,6 +15,7 @@ from magtwin.files.file import shipped
 from magtwin.learn.data.alignment import alignment_of
 from magtwin.learn.data.labels import labelled
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+from magtwin.path import loops, path_named
 from magtwin.report.verdict import Z_90
 
 LOAD_NT = (420.0, -390.0, 695.0)
@@ -47,7 +48,7 @@ def draw(run, label, readings):
         axis.set_title(name, loc="left")
         axis.set_ylabel("field of the robot [nT]")
         axis.margins(x=0)
-    axes[0].legend(ncols=3, loc="upper right", bbox_to_anchor=(1.0, 1.16), frameon=False)
+    figure.legend(*axes[0].get_legend_handles_labels(), ncols=3, loc="outside lower center", frameon=False)
     axes[1].text(MINUTE_S / 2, 0.03, "the minute", ha="center", transform=axes[1].get_xaxis_transform())
     axes[1].set_xlabel("time [s]")
     return figure
@@ -56,8 +57,10 @@ def draw(run, label, readings):
 def main():
     """Drive with the load, predict before and after calibration, draw and print."""
     field = mt.load_map(shipped("maps", "lab", "lab.usdc"))
-    options = {"magnetometer": "physical", "rate_hz": 10.0, "duration_s": 180.0, "seed": 3}
-    run = mt.simulate("lab", "random", interference=[load], **options)
+    minute, after = loops(), path_named("curvilinear")
+    ways = [way.at(np.linspace(0, length, 1000)) for way, length in ((minute, 13.5), (after, after.length))]
+    options = {"magnetometer": "physical", "rate_hz": 10.0, "seed": 3}
+    run = mt.simulate("lab", np.vstack(ways), interference=[load], **options)
     model = mt.load_predictor(shipped("weights", "turtlebot4_mixed.safetensors"))
     today = mt.calibrate(None, run, anomaly_map=field, duration_s=MINUTE_S)
     exact = labelled(run, field, alignment_of(model.metadata))

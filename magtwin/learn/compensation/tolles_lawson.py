@@ -61,7 +61,7 @@ VECTOR = "b_vector_measured_nt"
 RIDGES = np.logspace(-12, 3, 31)
 """Ridge penalties of the cross-validation, relative to the mean square of the standardised columns."""
 
-LEAST_OWN = 0.01
+LEAST_OWN = 1e-6
 """Share of a column that no other columns explain, below which its coefficient is not determined."""
 
 MOST_DELAY_S = 0.5
@@ -344,6 +344,7 @@ def fit_tolles_lawson(
             "a pass band excludes a bias, so it cannot be fitted; leave the bias out, or fit all "
             "frequencies (band_hz=None, --no-band)"
         )
+    whole = matrix
     if band_hz is not None:
         matrix, b = (band_pass(v, band_hz, rate_hz, preset=preset) for v in (matrix, b))
         if len(b) <= len(names):
@@ -355,7 +356,7 @@ def fit_tolles_lawson(
         rows = np.vstack([matrix, np.sqrt(penalty) * np.eye(len(names))])
         c = np.linalg.lstsq(rows, np.concatenate([b, np.zeros(len(names))]), rcond=None)[0]
         left = b - matrix @ c
-        known = _determined(matrix, left)
+        known = _determined(matrix, left, whole, b)
         return TollesLawson(
             tuple(terms), tuple(c.tolist()), band_hz, penalty, float(np.std(left)), preset, *known
         )
@@ -366,15 +367,15 @@ def fit_tolles_lawson(
     c = _ridge(scaled.T @ scaled, scaled.T @ b, chosen * len(b)) / size
     left = b - matrix @ c
     fitted = tuple(terms), tuple(c.tolist()), band_hz, chosen, float(np.std(left))
-    return TollesLawson(*fitted, "magtwin", *_determined(matrix, left))
+    return TollesLawson(*fitted, "magtwin", *_determined(matrix, left, whole, b))
 
 
-def _determined(matrix: Array, left: Array) -> tuple[tuple[float, ...], float]:
+def _determined(matrix: Array, left: Array, whole: Array, b: Array) -> tuple[tuple[float, ...], float]:
     """Standard deviations of coefficients by least squares, and the condition number of the columns.
 
     Residuals are correlated: their sum has the variance of white ones times 1 + 2 sum of autocorrelations, up
-    to the first below 0. A column that is constant, or `LEAST_OWN` of which is not a sum of others, is not
-    determined.
+    to the first below 0. Not determined is a column that is constant, or a sum of others up to `LEAST_OWN`;
+    or whose interval, in any attitude of the `whole` run, is wider than what there is to explain, `b`.
     """
     size = np.sqrt(np.mean(matrix**2, axis=0))
     seen = size > 1e-9 * size.max()
@@ -388,9 +389,9 @@ def _determined(matrix: Array, left: Array) -> tuple[tuple[float, ...], float]:
     inflated = max(1 + 2 * float(lagged[1:kept].sum()), 1.0)
     sd = np.full(len(size), np.inf)
     sd[seen] = np.sqrt(np.mean(left**2) * inflated * inverse / len(left)) / size[seen]
-    undetermined = np.zeros(len(size), bool)
-    undetermined[seen] = inverse > 1 / LEAST_OWN
-    sd[undetermined] = np.inf
+    vague = Z_90 * sd * np.abs(whole).max(axis=0) > b.std()
+    vague[seen] |= inverse > 1 / LEAST_OWN
+    sd[vague] = np.inf
     return tuple(sd.tolist()), float(np.sqrt(strength[-1] / max(strength[0], 1e-30)))
 
 

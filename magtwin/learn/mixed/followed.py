@@ -143,37 +143,22 @@ class FollowedEffects:
         ahead = 0.0 if first else step
         a, x = np.exp(-ahead / self._memory_s), self._whole(np.array([t]), phi[None])[:, 0]
         self._log = self.hidden.log_prior + math.exp(-ahead / MEMORY_S) * (self._log - self.hidden.log_prior)
-        try:
-            LOOPS.open().step(
-                *(
-                    self.mean,
-                    self.covariance,
-                    self._log,
-                    self._mean,
-                    self._prior.covariance,
-                    self.hidden.variance,
-                ),
-                *(a, x, float(y), float(variance_nt2 / weight)),
-            )
-        except ImportError:  # without numba
-            self._step(a, x, y, variance_nt2 / weight)
+        LOOPS.open().step(
+            *(
+                self.mean,
+                self.covariance,
+                self._log,
+                self._mean,
+                self._prior.covariance,
+                self.hidden.variance,
+            ),
+            *(a, x, float(y), float(variance_nt2 / weight)),
+        )
         self._log -= self._log.max()
         self.t, self.count = t, self.count + 1
         if not self._past or t - self._past[-1].t >= 1.0:
             self._past.append(State(t, self.mean.copy(), self.covariance.copy(), self.probabilities))
         return True
-
-    def _step(self, a: Array, x: Array, y: float, variance_nt2: float) -> None:
-        """As `magtwin.learn.mixed.compiled_step.step`."""
-        self.mean = self._mean + a * (self.mean - self._mean)
-        for k, prior in enumerate(self.hidden.variance):
-            whole = block_diag(self._prior.covariance, np.diag(prior))
-            now = np.outer(a[k], a[k]) * (self.covariance[k] - whole) + whole
-            turned = now @ x[k]
-            spread, left = x[k] @ turned + variance_nt2, y - x[k] @ self.mean[k]
-            self.mean[k] += turned * left / spread
-            self.covariance[k] = now - np.outer(turned, turned) / spread
-            self._log[k] -= 0.5 * (left**2 / spread + math.log(spread))
 
     def _judge(self, t: float, phi: Array, y: float, variance_nt2: float, weight: float) -> None:
         """Compare a label with its prediction from readings that were `delay_s` older."""

@@ -317,7 +317,7 @@ def test_the_field_of_a_battery_s_current_and_its_delay_come_back_inside_their_i
     model = fit_run(run, terms=("permanent", "induced5", "current"), band_hz=None)
     assert model.delay_s == pytest.approx(0.2)
     current = np.array(model.coefficients[-3:])
-    assert_allclose(current, PER_AMPERE_NT, atol=12.0)  # cosines are of the disturbed field: 400 of 45,000 nT
+    assert_allclose(current, PER_AMPERE_NT, atol=12.0)  # cosines of the disturbed field
     assert max(model.sd[-3:]) < 20.0
     assert model.residual_sd_nt < 30.0
     clean, _ = compensate_run(run, model)
@@ -336,11 +336,11 @@ def test_what_a_drive_does_not_excite_is_said_to_be_undetermined_and_not_exporte
     size = np.linalg.norm(b + np.array(PLATFORM.hard_iron_nt), axis=1)
     model = fit_tolles_lawson(size, b, RATE_HZ, terms=("permanent",), band_hz=None)
     assert np.isinf(model.sd).tolist() == [False, False, True]  # on a level floor u_z is constant
-    assert "not determined" in str(model.report("model"))
+    said = {figure.name: str(figure.value) for figure in model.report("model").figures}
+    assert said["permanent z"] == "not determined: the drive does not excite it"
     made = model.parameters("px4")
     assert set(made) == {"CAL_MAG0_XOFF", "CAL_MAG0_YOFF"}
     assert made["CAL_MAG0_XOFF"] == pytest.approx(415e-5, abs=2e-4)  # in gauss
     assert made["CAL_MAG0_YOFF"] == pytest.approx(-760e-5, abs=2e-4)  # to the right
-    assert model.parameters("ardupilot")["COMPASS_OFS_X"] == pytest.approx(
-        -4.15, abs=0.2
-    )  # milligauss, added
+    offset = model.parameters("ardupilot")["COMPASS_OFS_X"]
+    assert offset == pytest.approx(-4.15, abs=0.2)  # milligauss, added
