@@ -86,7 +86,7 @@ def labelled_drive(
     At most `rate_hz` readings a second are taken. A drive without labels on the map, with readings of a
     network, or without a column of the model is refused by its `name`.
     """
-    run = read(Source("drive", lambda: run))
+    run = read(Source(name, lambda: run))
     try:
         run = labelled(run, field, alignment_of(model.metadata, "the model"))
     except InputError as error:
