@@ -19,7 +19,7 @@ from magtwin.learn.mixed.effects import (
 )
 from magtwin.learn.mixed.hidden import block_diag, hypotheses
 
-MEMORY_S = 600.0
+MEMORY_S = 1200.0
 """Time over which followed effects return to their prior mean [s]."""
 
 DELAY_S = 10.0

@@ -27,7 +27,7 @@ HARMONICS = 3
 WANDERING_S = (4.0, 15.0, 60.0)
 """Times over which a field that follows no period wanders [s]."""
 
-HIDDEN_SD_NT = 120.0
+HIDDEN_SD_NT = 100.0
 """Standard deviation of a hidden field; of the h-th harmonic it is 1 / h of that [nT]."""
 
 NOTHING, PERIODIC = 0.5, 0.35
