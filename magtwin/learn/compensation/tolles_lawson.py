@@ -557,6 +557,9 @@ def _unbroken(run: Run) -> tuple[Array, slice, float]:
             f"the run has no field vectors in {VECTOR}, which direction cosines need; record a vector "
             "magnetometer, or simulate a scene whose Earth field is known"
         )
+    if "b_map_nt" not in run:  # a uniform field: the size of a vector has no part in explaining the size
+        size = np.linalg.norm(b_vector, axis=1, keepdims=True)
+        b_vector = b_vector / np.where(size > 0, size, np.nan) * np.nanmedian(size)
     fine = np.isfinite(_above_map(run)) & np.isfinite(b_vector).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], fine.astype(np.int8), [0]])))
     starts, stops = edges[::2], edges[1::2]
