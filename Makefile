@@ -141,6 +141,7 @@ assets: $(VENV)/.dev  ## Build robots/, maps/, weights/ and scenes/ anew
 	$(BIN)/python maps/lab/build.py
 	$(BIN)/python scenes/build.py  # names the new map; its network is the old one until the last line
 	rm -rf build/paper/lab && $(BIN)/python weights/protocol.py --out build/paper/lab --ship
+	rm -rf build/paper/mixed && $(BIN)/python weights/mixed.py --out build/paper/mixed --ship
 	$(BIN)/python scenes/build.py
 
 pictures: $(VENV)/.installed build/blender/.installed  ## Draw the pictures of README and docs again (needs npm and chromium)
@@ -153,6 +154,7 @@ pictures: $(VENV)/.installed build/blender/.installed  ## Draw the pictures of R
 	$(BIN)/python docs/page_film.py build/pictures/run.html docs/page.gif docs/page.png
 	$(BIN)/magtwin plot build/pictures/run.parquet --camera 0.4,-1.6,6.1:0.4,-0.2,0 --size 560x350 --pace 10 --fps 8 --out docs/run.gif --force
 	$(BIN)/python docs/python.py
+	$(BIN)/python docs/load.py
 	MAGTWIN_BLENDER=$(CURDIR)/build/blender/bin/python $(BIN)/python docs/looks.py
 
 clean:  ## Remove the environment and what was built

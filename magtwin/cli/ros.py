@@ -194,12 +194,13 @@ def magnetometer(
     online
         Topic of late poses, by which a mixed model follows its session: PoseStamped,
         PoseWithCovarianceStamped, TransformStamped or Odometry, whose stamps may lie some seconds in the
-        past. Readings are then published on predicted/magnitude and predicted/total_field_nt.
+        past. Readings are then published on predicted/magnitude and predicted/total_field_nt. If the scene
+        has no mixed model, that which ships with magtwin is used.
     measured
         Topic of the field that a real sensor measures, for --online: MagneticField or Float64, in T or nT.
         Default: qtfm/magnitude.
     """
-    from magtwin.ros.magnetometer import PARAMETERS, Magnetometer
+    from magtwin.ros.magnetometer import PARAMETERS, Magnetometer, following
     from magtwin.ros.parameters import settings as settings_of
     from magtwin.twin import open_twin
 
@@ -207,6 +208,8 @@ def magnetometer(
     announce(f"opening {scene}")
     opening: Any = {"lab": lab, "map_layer": map_layer, "network": network}
     twin = open_twin(scene, model_error=False, **opening)  # it predicts for a robot that reads
+    if online is not None and network is None:
+        twin = following(twin)
     with where.bus("magtwin_magnetometer", sim_time=values["use_sim_time"], duration_s=duration_s) as bus:
         options: Any = {"online": online, "measured": measured, "frame_prefix": frame_prefix or ""}
         Magnetometer(twin, bus, values, say=announce, **options)

@@ -104,6 +104,9 @@ class Magnetometer:
             InputError: The scene's magnetometer is physical, or its network reads columns that no input has.
                 With `online`: the model is of another kind, or a name is not that of a topic.
         """
+        from magtwin.learn.data.features import columns_of
+        from magtwin.learn.inference.calibrate import mixed_of_kind
+
         robot = twin.scene.robot
         if twin.magnetometer is None and robot.magnetometer.kind != "map-only":
             raise InputError(
@@ -118,7 +121,10 @@ class Magnetometer:
         self.inputs = self._node.inputs
         self.latencies_s = self._node.latencies_s
         """Latency of the last readings [s], from when the step was due or its newest input was sent."""
-        columns = twin.magnetometer.columns if twin.magnetometer else frozenset()
+        self._net = None if twin.magnetometer is None else twin.magnetometer.net
+        if self._net is not None and self._net.kind == "mixed":  # it does without signals
+            self._net = mixed_of_kind(self._net).reading(MADE.union(*(topic.needs for topic in INPUTS)))
+        columns = frozenset(() if self._net is None else columns_of(self._net.features))
         history_s = 0.0 if online is None else settings["buffer_s"]
         self._listen(columns - MADE, history_s)
         if "lidar_on" in columns and settings["lidar"] == "scan":
@@ -131,8 +137,8 @@ class Magnetometer:
         self._outside, self._strange, self._given = 0, 0, 0
         self._reader: Reader | None = None  # None: the map alone
         self._pose_late_ns = 0
-        if twin.magnetometer is not None:
-            self._reader, self._pose_late_ns = _reader_of(twin.magnetometer.net, twin.field)
+        if self._net is not None:
+            self._reader, self._pose_late_ns = _reader_of(self._net, twin.field)
         self.online = self._followed(online, measured)
         """The session that a mixed model follows."""
         if settings["units"] == "nT":
@@ -148,7 +154,7 @@ class Magnetometer:
             return None
         from magtwin.ros.online import Online
 
-        if self._twin.magnetometer is None:
+        if self._net is None:
             raise InputError(
                 "`online` follows the session of a mixed model, and this magnetometer has no network"
             )
@@ -159,7 +165,7 @@ class Magnetometer:
             )
         return Online(
             self._node,
-            self._twin.magnetometer.net,
+            self._net,
             self._twin.field,
             self._settings,
             poses=poses,
@@ -296,6 +302,17 @@ class Magnetometer:
         }
         self._outside = self._strange = self._given = 0
         return [self._node.status("readings", "reading", silent, problems, values)]
+
+
+def following(twin: "Twin") -> "Twin":
+    """The twin with a mixed model, that which ships if its own network is another."""
+    from magtwin.learn.inference.calibrate import shipped_mixed
+    from magtwin.learn.inference.magnetometer import NeuralMagnetometer
+
+    if twin.magnetometer is not None and twin.magnetometer.net.kind == "mixed":
+        return twin
+    path = shipped_mixed()
+    return replace(twin, magnetometer=NeuralMagnetometer.load(path))
 
 
 def _reader_of(net: "Predictor", field: AnomalyMap) -> tuple["Reader", int]:

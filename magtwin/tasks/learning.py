@@ -40,6 +40,7 @@ from magtwin.learn.evaluation.evaluate import evaluate as judge
 from magtwin.learn.evaluation.evaluate import trials_of, unlearned, unseen
 from magtwin.learn.evaluation.evaluation import Evaluation
 from magtwin.learn.inference.calibrate import calibrate as calibrate_model
+from magtwin.learn.inference.calibrate import shipped_mixed
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.inference.widen import widened
 from magtwin.learn.mixed.mixed import Mixed
@@ -220,7 +221,7 @@ def evaluate(
 
 
 def calibrate(
-    model: File | Predictor,
+    model: File | Predictor | None,
     run: Run | File,
     *,
     anomaly_map: AnomalyMap | File,
@@ -241,7 +242,8 @@ def calibrate(
     poses that were estimated on the map.
 
     Args:
-        model: A mixed model or its weights file (`magtwin train --model mixed`).
+        model: A mixed model or its weights file (`magtwin train --model mixed`). None: that which
+            ships, of sessions and plants of the TurtleBot 4.
         run: The drive or its file, with poses from another source than the map.
         anomaly_map: The map that the model was trained on: a map layer, a stage, or a folder of survey CSVs.
         duration_s: Length of the part to use, from the start [s]. Default: all.
@@ -259,6 +261,8 @@ def calibrate(
     if out is not None:
         check_free(out, force=force)
     name, parent = str(getattr(run, "metadata", {}).get("name", "")), {}
+    own_map = model is not None
+    model = shipped_mixed() if model is None else model
     if isinstance(model, str | os.PathLike):
         path = existing(model, "weights file")
         model, parent = load_predictor(path), {"parent": path.name, "parent_sha256": sha256(path)}
@@ -274,6 +278,7 @@ def calibrate(
         pose_from_map=pose_from_map,
         parent=parent,
         name=name,
+        own_map=own_map,
     )
     if out is not None:
         calibrated.save(out, force=force)

@@ -326,7 +326,7 @@ def test_histories_last_as_long_as_they_are_told(
 @pytest.mark.parametrize(
     ("kind", "options", "text"),
     [
-        ("mlp", {}, "kind 'mlp' has no effects of a session; train one with --model mixed"),
+        ("mlp", {}, "kind 'mlp' has no effects of a session; take the one that ships"),
         (None, {}, "this magnetometer has no network"),
         ("mixed", {"measured": "predicted/magnitude"}, "is published by this node; name the topic of a real"),
         ("mixed", {"online": "a pose"}, "is not a topic's name"),

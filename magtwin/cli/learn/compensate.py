@@ -24,6 +24,7 @@ def fit(
     no_band: Flag = False,
     penalty: float | None = None,
     preset: Literal["magtwin", "magnav"] = "magtwin",
+    current: Flag = False,
     force: Force = False,
 ) -> Done:
     """Fit the model to a calibration run that turns through all headings in a uniform or well mapped field.
@@ -34,7 +35,8 @@ def fit(
     Parameters
     ----------
     run
-        Run with field vectors (.parquet).
+        Run or log with field vectors, of any kind that `magtwin info` reads. Without a map its field is taken
+        as uniform.
     out
         Model to write, a .json file.
     terms
@@ -48,16 +50,18 @@ def fit(
         Penalty of the regression. Default: by cross-validation, or 0 with --preset magnav.
     preset
         Conventions of the regressors, the filter and the penalty: magtwin's own, or those of MagNav.jl.
+    current
+        Fit the field of the battery's current too, with its delay.
     """
     from magtwin.files.outputs import output
-    from magtwin.io.tables import read_parquet
+    from magtwin.io.formats import read_run
     from magtwin.learn.compensation.tolles_lawson import fit_run
 
     out = named(out, (".json",), "a Tolles-Lawson model", force=force)
-    names = tuple(name.strip() for name in terms.split(",") if name.strip())
+    names = tuple(name.strip() for name in f"{terms}{',current' * current}".split(",") if name.strip())
     step("Fitting the model")
     how: Any = {"band_hz": None if no_band else band_hz, "ridge": penalty, "preset": preset}
-    model = fit_run(read_parquet(expected(run, "run")), terms=names, **how)
+    model = fit_run(read_run(run), terms=names, **how)
     with output(out, force=force) as aside:
         model.save(aside)
     return Done(model.report(f"Tolles-Lawson model of {run}"), out)
@@ -70,18 +74,45 @@ def apply(run: Path, model: Path, *, out: Path, force: Force = False) -> Done:
     Parameters
     ----------
     run
-        Run with field vectors (.parquet).
+        Run or log with field vectors, of any kind that `magtwin info` reads.
     model
         Model that `magtwin model compensate fit` wrote (.json).
     out
         Compensated run to write, a .parquet file.
     """
-    from magtwin.io.tables import read_parquet, write_parquet
+    from magtwin.io.formats import read_run
+    from magtwin.io.tables import write_parquet
     from magtwin.learn.compensation.tolles_lawson import TollesLawson, compensate_run
 
     out = named(out, (".parquet",), "a run", force=force)
     compensated, report = compensate_run(
-        read_parquet(expected(run, "run")), TollesLawson.load(expected(model, "Tolles-Lawson model"))
+        read_run(run), TollesLawson.load(expected(model, "Tolles-Lawson model"))
     )
     write_parquet(compensated, out, force=force)
     return Done(report, out, next=(("magtwin", "report", out),))
+
+
+@compensate_app.command
+def export(model: Path, *, out: Path, force: Force = False) -> Done:
+    """Write a model's offsets and current terms as parameters of an autopilot.
+
+    Parameters
+    ----------
+    model
+        Model that `magtwin model compensate fit` wrote (.json).
+    out
+        File to write: .params of PX4 (CAL_MAG0_*), or .parm of ArduPilot (COMPASS_OFS_*, COMPASS_MOT_*).
+    """
+    from magtwin.files.outputs import output
+    from magtwin.learn.compensation.tolles_lawson import TollesLawson
+
+    out = named(out, (".params", ".parm"), "parameters", force=force)
+    made = TollesLawson.load(expected(model, "Tolles-Lawson model"))
+    px4 = out.suffix == ".params"
+    lines = [
+        f"1\t1\t{name}\t{value:.8g}\t{6 if isinstance(value, int) else 9}" if px4 else f"{name},{value:.8g}"
+        for name, value in made.parameters("px4" if px4 else "ardupilot").items()
+    ]
+    with output(out, force=force) as aside:
+        aside.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return Done(wrote=out, text=f"{len(lines)} parameters", data={"parameters": len(lines)})

@@ -89,27 +89,29 @@ def widen(
 @model_app.command
 @reads_recordings
 def calibrate(
-    weights: Path,
     run: Path,
+    weights: Path | None = None,
     *,
     map: TrainedMap,  # noqa: A002
-    out: Weights,
+    out: Weights = Path("calibrated.safetensors"),
     duration_s: float | None = None,
     pose_sd_m: float = 0.0,
     pose_from_map: Flag = False,
     force: Force = False,
 ) -> Done:
-    """Calibrate a mixed model by a labelled drive at the start of a session.
+    """Calibrate a magnetometer by a labelled drive at the start of a session.
 
     Drive for a minute in curves to all sides, with poses of another source than the map. The new weights
     predict in that session, until the robot is switched off; their metadata name the drive and the model.
+    What a drive lacks, such as a battery's current, the model does without.
 
     Parameters
     ----------
-    weights
-        Weights of a mixed model, .safetensors (`magtwin train --model mixed`).
     run
         The drive, of any kind that `magtwin dataset build` reads.
+    weights
+        Weights of a mixed model, .safetensors (`magtwin train --model mixed`), before or after the drive.
+        Default: turtlebot4_mixed, which ships.
     duration_s
         Length of the part to use, from the start [s]. Default: all.
     pose_sd_m
@@ -119,6 +121,8 @@ def calibrate(
     """
     from magtwin.tasks.learning import calibrate as calibrate_files
 
+    if weights is not None and run.suffix in (".safetensors", ".pth"):
+        run, weights = weights, run
     out = named(out, (".safetensors",), "a network", force=force)
     step("Calibrating on the drive")
     poses: Any = {"pose_sd_m": pose_sd_m, "pose_from_map": pose_from_map}

@@ -1,9 +1,10 @@
 """Tolles-Lawson compensation: the platform's part of scalar readings, linear in functions of its attitude."""
 
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from magtwin.errors import InputError, find
 from magtwin.files.file import read_text
 from magtwin.report.report import Figure, Report
-from magtwin.report.verdict import verdict
+from magtwin.report.verdict import Z_90, verdict
 from magtwin.run.run import Run
 from magtwin.run.thinning import stretches
 
@@ -32,11 +33,13 @@ TERMS: Mapping[str, int] = MappingProxyType(
         "eddy3": 3,
         "eddy8": 8,
         "eddy9": 9,
+        "current": 3,
         "bias": 1,
     }
 )
 """Number of columns of each term. induced5 drops yy and induced3 keeps xx, yy, zz; eddy8 drops y dy/dt and
-eddy3 keeps x dx/dt, y dy/dt, z dz/dt. The preset "magnav" drops zz and z dz/dt instead."""
+eddy3 keeps x dx/dt, y dy/dt, z dz/dt. "current" is the field of the battery's current. The preset "magnav"
+drops zz and z dz/dt instead."""
 
 DEFAULT_TERMS = ("permanent", "induced6", "eddy9")
 DEFAULT_BAND_HZ = (0.1, 0.9)
@@ -59,6 +62,14 @@ VECTOR = "b_vector_measured_nt"
 RIDGES = np.logspace(-12, 3, 31)
 """Ridge penalties of the cross-validation, relative to the mean square of the standardised columns."""
 
+LEAST_OWN = 1e-6
+"""Share of a column that no other columns explain, below which its coefficient is not determined."""
+
+MOST_DELAY_S = 0.5
+"""Longest delay of the battery's current that is tried [s]."""
+
+NT_PER_GAUSS = 1e5
+
 FOLDS = 10  # Number of stretches of a run for the cross-validation
 
 
@@ -68,12 +79,13 @@ def design_matrix(
     terms: Sequence[str] = DEFAULT_TERMS,
     *,
     preset: str = "magtwin",
+    current_a: ArrayLike | None = None,
 ) -> tuple[Array, tuple[str, ...]]:
     """The regressors of Tolles and Lawson (1950), in the form of Leliak (1961).
 
     With the direction cosines u = B / |B| of the total field in the platform's axes: permanent terms
-    u_i, induced terms |B| u_i u_j, eddy terms |B| u_i du_j/dt, and a constant for the bias. Derivatives
-    are central differences.
+    u_i, induced terms |B| u_i u_j, eddy terms |B| u_i du_j/dt, current terms I u_i, and a constant for the
+    bias. Derivatives are central differences.
 
     Args:
         b_vector_nt: Field of a vector magnetometer in the platform's axes [nT], shape (N, 3).
@@ -81,10 +93,12 @@ def design_matrix(
         terms: Names of `TERMS`, in the order of the columns.
         preset: A name of `PRESETS`. With "magnav", induced terms are u_i B_j / 50,000 nT and eddy terms
             u_i dB_j / 50,000 nT, with the difference dB of B per sample.
+        current_a: Current I of the battery, for "current" [A], shape (N,).
 
     Returns:
         Matrix of shape (N, K), and the names of the K columns. Coefficients are in nT for permanent terms and
-        the bias, without unit for induced terms, and in s for eddy terms; with "magnav" all are in nT.
+        the bias, in nT/A for current terms, without unit for induced terms, and in s for eddy terms; with
+        "magnav" all but the current's are in nT.
 
     Raises:
         InputError: A term is unknown or given twice, or the field is not (N, 3), zero, or not finite.
@@ -115,6 +129,12 @@ def design_matrix(
         if term == "permanent":
             columns.append(u)
             names += [f"permanent {a}" for a in "xyz"]
+        elif term == "current":
+            amperes = np.full(len(b), np.nan) if current_a is None else np.asarray(current_a, float)
+            if amperes.shape != size.shape or not np.isfinite(amperes).all():
+                raise InputError("the term current needs the battery's current at every reading (battery_a)")
+            columns.append(u * amperes[:, None])
+            names += [f"current {a}" for a in "xyz"]
         elif term == "bias":
             columns.append(np.ones((len(b), 1)))
             names.append("bias")
@@ -152,12 +172,25 @@ class TollesLawson:
     preset: Preset = "magtwin"
     """Conventions of the regressors and the fit, a name of `PRESETS`."""
 
-    def interference_nt(self, b_vector_nt: ArrayLike, rate_hz: float) -> Array:
+    sd: tuple[float, ...] = ()
+    """Standard deviation of each coefficient, in its unit; infinite if the run does not determine it. () if
+    unknown."""
+
+    condition: float = math.nan
+    """Condition number of the columns, each divided by its RMS."""
+
+    delay_s: float = 0.0
+    """Time by which the battery's current is late [s]."""
+
+    def interference_nt(
+        self, b_vector_nt: ArrayLike, rate_hz: float, current_a: ArrayLike | None = None
+    ) -> Array:
         """Part of the magnitude from the platform [nT], shape (N,); arguments as for `design_matrix`.
 
         It is minus its mean, unless the terms have a bias or the preset is "magnav".
         """
-        matrix, _ = design_matrix(b_vector_nt, rate_hz, self.terms, preset=self.preset)
+        current = None if current_a is None else late(current_a, self.delay_s, rate_hz)
+        matrix, _ = design_matrix(b_vector_nt, rate_hz, self.terms, preset=self.preset, current_a=current)
         modelled = matrix @ np.asarray(self.coefficients)
         kept = self.preset == "magnav" or "bias" in self.terms
         return modelled if kept else modelled - modelled.mean()
@@ -166,9 +199,38 @@ class TollesLawson:
         """Scalar readings without the platform's part [nT], shape (N,)."""
         return np.asarray(b_nt, float) - self.interference_nt(b_vector_nt, rate_hz)
 
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the coefficients."""
+        current = np.ones(3) if "current" in self.terms else None
+        return design_matrix(np.eye(3), 1.0, self.terms, preset=self.preset, current_a=current)[1]
+
+    def parameters(self, kind: Literal["px4", "ardupilot"]) -> dict[str, float]:
+        """Offsets and current terms as parameters of an autopilot, whose axes are forward, right, down.
+
+        PX4 subtracts CAL_MAG0_OFF [G] and adds CAL_MAG0_COMP per kA; ArduPilot adds COMPASS_OFS [mG] and
+        COMPASS_MOT per A. Coefficients that the run does not determine are left out.
+        """
+        px4, made = kind == "px4", {}
+        for name, value, sd in zip(self.columns, self.coefficients, self.sd, strict=True):
+            term, _, axis = name.partition(" ")
+            if term in ("permanent", "current") and math.isfinite(sd):
+                turned = (value if axis == "x" else -value) / NT_PER_GAUSS
+                if term == "permanent":
+                    key = f"CAL_MAG0_{axis.upper()}OFF" if px4 else f"COMPASS_OFS_{axis.upper()}"
+                    made[key] = turned if px4 else -1e3 * turned
+                else:
+                    key = f"CAL_MAG0_{axis.upper()}COMP" if px4 else f"COMPASS_MOT_{axis.upper()}"
+                    made[key] = -1e3 * turned
+        if "current" in self.terms:
+            made["CAL_MAG_COMP_TYP" if px4 else "COMPASS_MOTCT"] = 2
+        return made
+
     def save(self, path: Path) -> None:
         """Write the model as JSON."""
-        path.write_text(json.dumps({"kind": "magtwin Tolles-Lawson model", **asdict(self)}, indent=2) + "\n")
+        data = {**asdict(self), "sd": [value if math.isfinite(value) else None for value in self.sd]}
+        data["condition"] = self.condition if math.isfinite(self.condition) else None
+        path.write_text(json.dumps({"kind": "magtwin Tolles-Lawson model", **data}, indent=2) + "\n")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "TollesLawson":
@@ -188,6 +250,9 @@ class TollesLawson:
                 float(data["ridge"]),
                 float(data["residual_sd_nt"]),
                 data.get("preset", "magtwin"),
+                tuple(math.inf if sd is None else float(sd) for sd in data.get("sd", ())),
+                float(data.get("condition") or math.nan),
+                float(data.get("delay_s", 0.0)),
             )
             _is_magnav(str(model.preset))
             if data.get("vector", "measured") != "measured":
@@ -206,7 +271,16 @@ class TollesLawson:
         return model
 
     def report(self, title: str) -> Report:
-        """Terms, penalty and residual."""
+        """Terms, penalty and residual, and each coefficient with its 90 % interval."""
+        units = {"induced": "", "eddy": "s", "current": "nT/A"} if self.preset == "magtwin" else {}
+        each = [
+            Figure(name, value, units.get(name.split()[0], "nT"), Z_90 * sd, "90 % interval")
+            if math.isfinite(sd)
+            else Figure(name, "not determined: the drive does not excite it")
+            for name, value, sd in zip(self.columns, self.coefficients, self.sd, strict=bool(self.sd))
+        ]
+        if "current" in self.terms:
+            each.append(Figure("delay of the current", self.delay_s, "s"))
         band = "all frequencies" if self.band_hz is None else f"{self.band_hz[0]:g} to {self.band_hz[1]:g} Hz"
         return Report(
             title,
@@ -214,6 +288,8 @@ class TollesLawson:
                 Figure("coefficients", len(self.coefficients)),
                 Figure("ridge", self.ridge),
                 Figure("residual", self.residual_sd_nt, "nT", note=f"standard deviation, {band}"),
+                Figure("condition number", self.condition),
+                *each,
             ),
             {"terms": list(self.terms), "vector": VECTOR, "preset": self.preset},
         )
@@ -228,6 +304,7 @@ def fit_tolles_lawson(
     band_hz: tuple[float, float] | None = DEFAULT_BAND_HZ,
     ridge: float | None = None,
     preset: Preset = "magtwin",
+    current_a: ArrayLike | None = None,
 ) -> TollesLawson:
     """Fit the coefficients by ridge regression between band-passed readings and regressors.
 
@@ -247,12 +324,13 @@ def fit_tolles_lawson(
         band_hz: Pass band [Hz]; None fits all frequencies.
         ridge: Penalty r. Default: by cross-validation, or 0 with "magnav".
         preset: A name of `PRESETS`.
+        current_a: As for `design_matrix`.
 
     Raises:
         InputError: Arguments do not fit each other, a value is not finite, or readings are too few.
     """
     b, magnav = np.asarray(b_nt, float), _is_magnav(preset)
-    matrix, names = design_matrix(b_vector_nt, rate_hz, terms, preset=preset)
+    matrix, names = design_matrix(b_vector_nt, rate_hz, terms, preset=preset, current_a=current_a)
     if b.shape != (len(matrix),):
         raise InputError(f"b_nt must have shape ({len(matrix)},), as b_vector_nt has rows, got {b.shape}")
     if not np.all(np.isfinite(b)):
@@ -267,6 +345,7 @@ def fit_tolles_lawson(
             "a pass band excludes a bias, so it cannot be fitted; leave the bias out, or fit all "
             "frequencies (band_hz=None, --no-band)"
         )
+    whole = matrix
     if band_hz is not None:
         matrix, b = (band_pass(v, band_hz, rate_hz, preset=preset) for v in (matrix, b))
         if len(b) <= len(names):
@@ -277,28 +356,89 @@ def fit_tolles_lawson(
         penalty = 0.0 if ridge is None else float(ridge)
         rows = np.vstack([matrix, np.sqrt(penalty) * np.eye(len(names))])
         c = np.linalg.lstsq(rows, np.concatenate([b, np.zeros(len(names))]), rcond=None)[0]
-        sd = float(np.std(b - matrix @ c))
-        return TollesLawson(tuple(terms), tuple(c.tolist()), band_hz, penalty, sd, preset=preset)
+        left = b - matrix @ c
+        known = _determined(matrix, left, whole, b)
+        return TollesLawson(
+            tuple(terms), tuple(c.tolist()), band_hz, penalty, float(np.std(left)), preset, *known
+        )
     size = np.sqrt(np.mean(matrix * matrix, axis=0))
     size[size <= 1e-9 * size.max()] = np.inf  # a constant column gets no coefficient
     scaled = matrix / size
     chosen = float(ridge) if ridge is not None else _cross_validated(scaled, b)
     c = _ridge(scaled.T @ scaled, scaled.T @ b, chosen * len(b)) / size
-    return TollesLawson(tuple(terms), tuple(c.tolist()), band_hz, chosen, float(np.std(b - matrix @ c)))
+    left = b - matrix @ c
+    fitted = tuple(terms), tuple(c.tolist()), band_hz, chosen, float(np.std(left))
+    return TollesLawson(*fitted, "magtwin", *_determined(matrix, left, whole, b))
+
+
+def _determined(matrix: Array, left: Array, whole: Array, b: Array) -> tuple[tuple[float, ...], float]:
+    """Standard deviations of coefficients by least squares, and the condition number of the columns.
+
+    Residuals are correlated: their sum has the variance of white ones times 1 + 2 sum of autocorrelations, up
+    to the first below 0. Not determined is a column that is constant, or a sum of others up to `LEAST_OWN`;
+    or whose interval, in any attitude of the `whole` run, is wider than what there is to explain, `b`.
+    """
+    size = np.sqrt(np.mean(matrix**2, axis=0))
+    seen = size > 1e-9 * size.max()
+    scaled = matrix[:, seen] / size[seen]
+    strength, axes = np.linalg.eigh(scaled.T @ scaled / len(left))
+    inverse = (axes**2) @ (1 / np.maximum(strength, 1e-15 * strength[-1]))
+    wave = np.fft.rfft(left - left.mean(), 2 * len(left))
+    lagged = np.fft.irfft(np.abs(wave) ** 2)[: len(left) // 4]
+    lagged = lagged / max(lagged[0], 1e-300)
+    kept = int(np.argmax(lagged < 0)) or len(lagged)
+    inflated = max(1 + 2 * float(lagged[1:kept].sum()), 1.0)
+    sd = np.full(len(size), np.inf)
+    sd[seen] = np.sqrt(np.mean(left**2) * inflated * inverse / len(left)) / size[seen]
+    vague = Z_90 * sd * np.abs(whole).max(axis=0) > b.std()
+    vague[seen] |= inverse > 1 / LEAST_OWN
+    sd[vague] = np.inf
+    return tuple(sd.tolist()), float(np.sqrt(strength[-1] / max(strength[0], 1e-30)))
+
+
+def late(values: ArrayLike, delay_s: float, rate_hz: float) -> Array:
+    """Values (N,) as they were `delay_s` before."""
+    known = np.asarray(values, float)
+    at = np.arange(len(known)) - delay_s * rate_hz
+    return np.asarray(np.interp(at, np.arange(len(known)), known))
 
 
 def fit_run(run: Run, **options: Any) -> TollesLawson:
     """`fit_tolles_lawson` on a run: b_measured_nt minus b_map_nt, against its field vectors.
 
     The longest unbroken stretch of rows with a map, a reading and a vector is used, because the filter needs
-    one. `options` are those of `fit_tolles_lawson`.
+    one. A run without a map is taken as of a uniform field. The delay of the current is that with the least
+    residual, up to `MOST_DELAY_S`. `options` are those of `fit_tolles_lawson`.
 
     Raises:
         InputError: The run has no such vectors, or too few in a row.
     """
     b_vector, rows, rate = _unbroken(run)
-    b = run["b_measured_nt"][rows] - run["b_map_nt"][rows]
-    return fit_tolles_lawson(b, b_vector[rows], rate, **options)
+    b = _above_map(run)[rows]
+    if "current" not in options.get("terms", DEFAULT_TERMS):
+        return fit_tolles_lawson(b, b_vector[rows], rate, **options)
+    amperes = np.interp(run["t"], *_known_current(run))[rows]
+    fits = [
+        (delay, fit_tolles_lawson(b, b_vector[rows], rate, current_a=late(amperes, delay, rate), **options))
+        for delay in np.linspace(0.0, MOST_DELAY_S, 6).tolist()
+    ]
+    delay, best = min(fits, key=lambda each: each[1].residual_sd_nt)
+    return replace(best, delay_s=delay)
+
+
+def _above_map(run: Run) -> Array:
+    """Measured field less the map, or less nothing where a run has no map [nT]."""
+    measured = run["b_measured_nt"]
+    return np.asarray(measured - run["b_map_nt"] if "b_map_nt" in run else measured)
+
+
+def _known_current(run: Run) -> tuple[Array, Array]:
+    """Times and values of the battery's current."""
+    amperes = run["battery_a"] if "battery_a" in run else np.full(run.rows, np.nan)
+    known = np.isfinite(amperes)
+    if not known.any():
+        raise InputError("the run has no current of a battery (battery_a); leave out --current")
+    return run["t"][known], amperes[known]
 
 
 def compensate_run(run: Run, model: TollesLawson) -> tuple[Run, Report]:
@@ -309,8 +449,9 @@ def compensate_run(run: Run, model: TollesLawson) -> tuple[Run, Report]:
     """
     b_vector, rows, rate = _unbroken(run)
     interference = np.full(run.rows, np.nan)
-    interference[rows] = model.interference_nt(b_vector[rows], rate)
-    before = (run["b_measured_nt"] - run["b_map_nt"])[rows]
+    current = np.interp(run["t"], *_known_current(run))[rows] if "current" in model.terms else None
+    interference[rows] = model.interference_nt(b_vector[rows], rate, current)
+    before = _above_map(run)[rows]
     after = before - interference[rows]
     if not before.std() > 0:
         raise InputError("b_measured_nt minus b_map_nt is constant, so there is nothing to remove")
@@ -417,7 +558,10 @@ def _unbroken(run: Run) -> tuple[Array, slice, float]:
             f"the run has no field vectors in {VECTOR}, which direction cosines need; record a vector "
             "magnetometer, or simulate a scene whose Earth field is known"
         )
-    fine = np.isfinite(run["b_measured_nt"] - run["b_map_nt"]) & np.isfinite(b_vector).all(axis=1)
+    if "b_map_nt" not in run:  # a uniform field: the size of a vector has no part in explaining the size
+        size = np.linalg.norm(b_vector, axis=1, keepdims=True)
+        b_vector = b_vector / np.where(size > 0, size, np.nan) * np.nanmedian(size)
+    fine = np.isfinite(_above_map(run)) & np.isfinite(b_vector).all(axis=1)
     rows = slice(*max(stretches(fine).tolist(), key=lambda ends: ends[1] - ends[0], default=(0, 0)))
     t = run["t"][rows]
     if len(t) < 3:

@@ -37,6 +37,10 @@ class Feature:
     """From the columns, each (N,) or (N, width), to inputs, (N,) or (N, width'); no row depends on another.
     None takes the one column as it is."""
 
+    session_sd_nt: float = 0.0
+    """Least standard deviation of its effect between sessions, in a mixed model [nT per unit]: parts that
+    differ more between robots of one type than training sessions show."""
+
 
 def degrees_0_360(yaw: NDArray[Any]) -> Array:
     """Headings [rad] as degrees in [0, 360), any shape."""
@@ -133,6 +137,16 @@ def warming(t: NDArray[Any], yaw: NDArray[Any]) -> Array:
     return np.column_stack([-np.expm1(-t / tau) * way for tau in WARM_S for way in ways])
 
 
+def wheels(yaw: NDArray[Any], wheel_angle: NDArray[Any]) -> Array:
+    """Cos and sin of the angles of both wheels, (N, 2), times 1, cos and sin of the heading, shape (N, 12).
+
+    The field of magnetised wheels turns with them, in a plane that is fixed to the robot.
+    """
+    turning = np.column_stack([np.cos(wheel_angle), np.sin(wheel_angle)])
+    ways = (np.ones_like(yaw), np.cos(yaw), np.sin(yaw))
+    return np.column_stack([turning * way[:, None] for way in ways])
+
+
 def _canonical(q: NDArray[Any]) -> Array:
     """Quaternions (N, 4) with w >= 0."""
     return q * np.where(q[:, 3:] < 0, -1.0, 1.0)
@@ -162,6 +176,13 @@ TURNED_MOTION = tuple(
 )
 TURNED_LAGS = tuple(f"{signal}_yaw_{part}" for signal in LAGS for part in ("sin", "cos"))
 WARM = tuple(f"warm_{tau:.0f}{way}" for tau in WARM_S for way in ("", "_yaw_cos", "_yaw_sin"))
+WHEELS = {
+    f"wheel_{side}_{part}{way}": sd_nt
+    for way, sd_nt in (("", 150.0), ("_yaw_cos", 80.0), ("_yaw_sin", 80.0))
+    for part in ("cos", "sin")
+    for side in ("left", "right")
+}
+"""Features of the wheels' angles, and what wheels as found on robots add [nT]."""
 EDDY = ("eddy_xdx", "eddy_xdy", "eddy_ydx", "eddy_ydy", "eddy_zdx", "eddy_zdy")
 
 FEATURES: Mapping[str, Feature] = MappingProxyType(
@@ -202,6 +223,10 @@ FEATURES: Mapping[str, Feature] = MappingProxyType(
         **_named(dict.fromkeys(INDUCED, ""), induced_products, _B),
         **_named(dict.fromkeys(EDDY, "1/s"), eddy_products, _B, "imu_w"),
         **_named(dict.fromkeys(WARM, ""), warming, "t", "yaw"),
+        **{
+            name: Feature(("yaw", "wheel_angle"), i, "", wheels, sd_nt)
+            for i, (name, sd_nt) in enumerate(WHEELS.items())
+        },
     }
 )
 """Every feature by name. Weights keep the names, so their meaning never changes."""
@@ -242,14 +267,15 @@ SETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "gradient": (*CIRCULAR, *GRADIENT, *CARRIED),
         "platform": PLATFORM,
         "session": (*PLATFORM, *WARM),
+        "wheels": (*PLATFORM, *WARM, *WHEELS),
         "vector": (*CIRCULAR, *GRADIENT, *CARRIED, *COSINES, *INDUCED, *EDDY),
     }
 )
 """Sets of features by name. "correlated": those with a Spearman correlation with the disturbance above 0.04
 in the paper's Figure 2. "gradient": "circular" and the map's gradient, for a lever arm and a latency.
 "platform": also currents, torques and the LiDAR by heading. "session": also parts that warm up after
-switching on. "vector": "gradient" and the platform's attitude
-in the field, from the vector axes."""
+switching on. "wheels": also magnetised wheels, by their angles. "vector": "gradient" and the platform's
+attitude in the field, from the vector axes."""
 
 
 def feature_names(names: str | Sequence[str]) -> tuple[str, ...]:

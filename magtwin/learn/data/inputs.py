@@ -45,6 +45,11 @@ class Inputs(Summarized):
         """Scaler and ranges as tensors of a weights file, by name, float64."""
         return dict(zip(SCALERS, (self.mean, self.scale, self.low, self.high), strict=True))
 
+    def take(self, kept: NDArray[np.bool_]) -> "Inputs":
+        """Some of the features, shape (F,)."""
+        names = tuple(name for name, keep in zip(self.features, kept.tolist(), strict=True) if keep)
+        return Inputs(names, *(values[kept] for values in (self.mean, self.scale, self.low, self.high)))
+
     def grown(self, other: "Inputs") -> "Inputs":
         """The same scaler, with ranges extended by those of other rows; unknown ranges stay unknown.
 

@@ -181,7 +181,10 @@ def read(source: Source) -> Run:
     run = source.read()
     posed = {"mocap_p", "mocap_q_xyzw"} <= set(run) or {"p_world_base", "yaw"} <= set(run)
     if not posed or "b_measured_nt" not in run:
-        wanted = "b_measured_nt" if posed else "mocap_p with mocap_q_xyzw, or p_world_base with yaw"
+        poses = (
+            "mocap_p with mocap_q_xyzw, or p_world_base with yaw; --pose-topic names a bag's topic of poses"
+        )
+        wanted = "b_measured_nt" if posed else poses
         raise InputError(f"{source.name}: nothing to label: it has no column {wanted}")
     if (kind := run.metadata.get("magnetometer")) in ("neural", "map-only"):
         raise InputError(

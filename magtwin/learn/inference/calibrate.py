@@ -5,12 +5,15 @@ import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import CalibrationWarning, InputError
 from magtwin.field.maps.map import AnomalyMap
+from magtwin.files.file import shipped
 from magtwin.frames import yaw_from_quat
 from magtwin.learn.data.alignment import alignment_of
 from magtwin.learn.data.features import columns_of, features
@@ -21,7 +24,7 @@ from magtwin.learn.mixed.effects import RATE_HZ, thinned_rows
 from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.predictor import Predictor
 from magtwin.learn.models.weights import MetadataValue
-from magtwin.run.run import Run
+from magtwin.run.run import COLUMNS, Run
 from magtwin.run.thinning import newest
 
 Array = NDArray[np.float64]
@@ -83,7 +86,7 @@ def labelled_drive(
     At most `rate_hz` readings a second are taken. A drive without labels on the map, with readings of a
     network, or without a column of the model is refused by its `name`.
     """
-    run = read(Source("drive", lambda: run))
+    run = read(Source(name, lambda: run))
     try:
         run = labelled(run, field, alignment_of(model.metadata, "the model"))
     except InputError as error:
@@ -110,13 +113,16 @@ def calibrate(
     pose_from_map: bool = False,
     parent: Mapping[str, MetadataValue] | None = None,
     name: str = "",
+    own_map: bool = True,
 ) -> Mixed:
     """Calibrate a mixed model by a labelled drive: `magtwin.calibrate` for a model and a run.
 
-    `parent` is metadata about the file of the model, `name` that of the drive.
+    `parent` is metadata about the file of the model, `name` that of the drive. With `own_map` another map
+    than that of the training is warned of.
     """
     what = name or "the drive"
-    model = mixed_of_kind(model)
+    whole = mixed_of_kind(model)
+    model = whole.reading(known_columns(run))
     check_pose_sd(pose_sd_m)
     if duration_s is not None and not 0 < duration_s < math.inf:
         raise InputError(f"duration_s must be above 0 s and finite, got {duration_s!r}")
@@ -130,7 +136,9 @@ def calibrate(
             f"drive for a minute on the map, in curves{longer}"
         )
     cautions = _cautions(drive, run, pose_from_map=pose_from_map)
-    if "map_samples_nt" in model.metadata and not same_map(model.metadata, field):
+    if absent := [c for c in columns_of(whole.features) if c not in columns_of(model.features)]:
+        cautions.append(f"it has no {', '.join(absent)}; what they would show counts as error")
+    if own_map and "map_samples_nt" in model.metadata and not same_map(model.metadata, field):
         cautions.append(
             f"the model was trained on the map {model.metadata.get('map', '')!r} and is calibrated on "
             f"another, {field.name!r}; use its own map"
@@ -160,12 +168,27 @@ def calibrate(
     return calibrated
 
 
+def known_columns(run: Run) -> set[str]:
+    """Columns of a run with numbers in them, and those that labels add."""
+    known = {name for name, column in run.columns.items() if name in COLUMNS and _known(column)}
+    return known | {"yaw", "b_map_gradient_nt_m"}
+
+
+def _known(column: NDArray[Any]) -> bool:
+    return column.dtype.kind != "f" or bool(np.isfinite(column).any())
+
+
 def _date(run: Run) -> str:
     """Date of a recorded bag, or that in the metadata; "" if neither is known."""
     start = str(run.metadata.get("start_ns", ""))
     if start.isdigit():
         return datetime.datetime.fromtimestamp(int(start) // 10**9, datetime.UTC).date().isoformat()
     return str(run.metadata.get("date", ""))
+
+
+def shipped_mixed() -> Path:
+    """The weights of the mixed model that ships, trained on sessions and plants of the TurtleBot 4."""
+    return shipped("weights", "turtlebot4_mixed.safetensors")
 
 
 def mixed_of_kind(model: Predictor) -> Mixed:
@@ -176,7 +199,8 @@ def mixed_of_kind(model: Predictor) -> Mixed:
     """
     if not isinstance(model, Mixed):
         raise InputError(
-            f"a model of the kind {model.kind!r} has no effects of a session; train one with --model mixed"
+            f"a model of the kind {model.kind!r} has no effects of a session; take the one that ships, "
+            "turtlebot4_mixed.safetensors, or train one with --model mixed"
         )
     return model
 

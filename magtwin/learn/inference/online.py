@@ -3,12 +3,19 @@
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap, Outside
-from magtwin.learn.inference.calibrate import check_pose_sd, labelled_drive, mixed_of_kind
+from magtwin.learn.inference.calibrate import (
+    check_pose_sd,
+    known_columns,
+    labelled_drive,
+    mixed_of_kind,
+)
 from magtwin.learn.inference.magnetometer import Read
 from magtwin.learn.inference.reader import Reader, Reading, Signals
-from magtwin.learn.mixed.effects import DELAY_S, MEMORY_S, FollowedEffects, followed
+from magtwin.learn.mixed.followed import DELAY_S, MEMORY_S, FollowedEffects, followed
 from magtwin.learn.mixed.mixed import Mixed
 from magtwin.learn.models.predictor import Predictor
 from magtwin.run.run import Run
@@ -52,7 +59,11 @@ class OnlineMagnetometer:
         self.model = _checked(model, delay_s, memory_s, pose_sd_m)
         self.pose_sd_m = pose_sd_m
         self.effects = FollowedEffects(
-            self.model.prior, start=self.model.session, delay_s=delay_s, memory_s=memory_s
+            self.model.prior,
+            start=self.model.session,
+            delay_s=delay_s,
+            memory_s=memory_s,
+            ways=self.model.ways,
         )
         self._reader = Reader(self.model, field, lever_arm_m=lever_arm_m)
 
@@ -102,7 +113,7 @@ class OnlineMagnetometer:
         """One reading with the effects of now; the arguments are those of `update` and `Reader.row`."""
         row = self._reader.row(p_xy, yaw, signals, outside=outside)
         phi = self.model.regressors(row.x[None])
-        mean, variance = self.effects.effects(t).predict(phi)
+        mean, variance = self.effects.predict(np.array([t]), phi)
         factor = self.model.factors["online"] * self.effects.widening
         sd = factor * math.sqrt(float(self.model.noise_nt2(phi)[0]) + float(variance[0]))
         beyond = bool(self.model.outside(row.x[None])[0])
@@ -131,11 +142,13 @@ def read_online(
     Raises:
         InputError: As for `magtwin.calibrate`.
     """
-    model = _checked(model, delay_s, memory_s, pose_sd_m)
+    model = _checked(model, delay_s, memory_s, pose_sd_m).reading(known_columns(run))
     drive = labelled_drive(model, run, field, rate_hz=None)
     phi = model.regressors(drive.x)
     noise = model.noise_nt2(phi)
-    effects = FollowedEffects(model.prior, start=model.session, delay_s=delay_s, memory_s=memory_s)
+    effects = FollowedEffects(
+        model.prior, start=model.session, delay_s=delay_s, memory_s=memory_s, ways=model.ways
+    )
     mean, sd = followed(
         effects, phi, drive.y, noise + drive.pose_variance_nt2(pose_sd_m), drive.t, predicted_nt2=noise
     )

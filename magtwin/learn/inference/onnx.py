@@ -229,6 +229,7 @@ class _Graph:
         variance = self.add("ReduceSum", cross, self.constant(np.array([1])), keepdims=0)
         variance = self.add("Add", variance, self.constant(effects.covariance[0, 0]))
         variance = self.add("Mul", variance, self.constant(share))
+        variance = self.add("Add", variance, self.constant(mixed.hidden_nt2))
         variance = self.add("Add", variance, self.variance(mixed.noise, z))
         return mean, self.add("Mul", self.add("Sqrt", variance), self.constant(factor))
 

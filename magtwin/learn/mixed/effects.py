@@ -1,5 +1,5 @@
 """Effects: coefficients that differ between sessions, their prior by EM and their posterior in one session:
-from a labelled drive at its start, or followed while it lasts.
+from a labelled drive at its start.
 
 The model of a session s is (Laird and Ware 1982, Biometrics 38, 963)
 
@@ -11,9 +11,7 @@ one, so that its likelihood is taken to the power w. With weights w and variance
     V = (Lambda^-1 + sum w phi phi' / v)^-1,   m = V (Lambda^-1 mu + sum w phi y / v)
 """
 
-import itertools
 import math
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -21,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from magtwin.learn.mixed.hidden import block_diag, hypotheses
 from magtwin.learn.models.calibration import quantile_factor
 
 Array = NDArray[np.float64]
@@ -49,20 +48,8 @@ RATE_HZ = 4.0
 BLOCK_S = 10.0
 """Length of the blocks that are left out of a drive in turn [s]."""
 
-MEMORY_S = 600.0
-"""Time over which followed effects return to their prior mean [s]."""
-
-DELAY_S = 10.0
-"""Age of the newest pose when a prediction is made online [s]."""
-
 LEAST_WIDENING, MOST_WIDENING = 0.7, 4.0
 """Least and largest factor by which a session's own errors change its intervals."""
-
-WIDENING_PRIOR_S = 30.0
-"""Time that the prior, a factor of 1, counts for in the factor of followed effects [s]."""
-
-WIDENING_MEMORY_S = 120.0
-"""Time over which earlier errors count in the factor of followed effects [s]."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +74,10 @@ class Effects:
             turned = (rows[:, None, :] * self.covariance).sum(axis=2)
             variance[start : start + _BLOCK] = (rows * turned).sum(axis=1)
         return mean, np.maximum(variance, 0.0)
+
+    def take(self, at: NDArray[np.intp]) -> "Effects":
+        """Some of the coefficients, whatever the others are."""
+        return Effects(self.mean[at], self.covariance[np.ix_(at, at)])
 
 
 @dataclass(frozen=True)
@@ -202,171 +193,97 @@ class DriveEffects(NamedTuple):
     effects: Effects
     """Posterior of the session's effects."""
 
-    widening: float
+    widening: float = 1.0
     """Factor z of standard deviations with which 90 % of the readings of a block lie in 90 % intervals that
     are predicted from the other blocks."""
 
-    left_out_nt: float
+    left_out_nt: float = math.nan
     """Root mean square error of these predictions [nT]; nan if there is one block."""
 
+    hidden_nt2: float = 0.0
+    """Variance of a field that no signal explains [nT^2]; at another time its phase is unknown."""
 
-def effects_of_drive(prior: Effects, phi: Array, y: Array, variance_nt2: Array, t: Array) -> DriveEffects:
+    period_s: float = math.nan
+    """Period of its strongest harmonic [s]; nan if there is probably none."""
+
+
+class _Hypothesis(NamedTuple):
+    """A hypothesis about hidden parts, with what blocks of a drive tell by it."""
+
+    prior: Effects
+    sums: list[Sums]
+    log_prior: float
+    rate: Array
+    """Angular frequencies of its coefficients [rad/s], shape (S,)."""
+
+    def given(self, left: int = -1) -> tuple[Effects, float]:
+        """Posterior and logarithm of the probability, up to a constant, by the blocks other than one left
+        out.
+        """
+        blocks = [sums for k, sums in enumerate(self.sums) if k != left]
+        sums = sum(blocks[1:], start=blocks[0])
+        after = posterior(self.prior, sums)
+        away = after.mean - self.prior.mean
+        precise = np.linalg.solve(self.prior.covariance, away)
+        misfit = sums.square - 2 * sums.sloped @ after.mean + after.mean @ sums.curved @ after.mean
+        volumes = np.linalg.slogdet(after.covariance)[1] - np.linalg.slogdet(self.prior.covariance)[1]
+        return after, self.log_prior + 0.5 * float(volumes - misfit - away @ precise)
+
+
+def _mixture(hypotheses: Sequence[_Hypothesis], own: int, left: int = -1) -> DriveEffects:
+    """The first `own` effects by all hypotheses, and what remains hidden, by the blocks other than one left
+    out.
+    """
+    found, log = zip(*(each.given(left) for each in hypotheses), strict=True)
+    odds = np.exp(np.array(log) - max(log))
+    odds /= odds.sum()
+    means, spreads = (
+        np.stack([each[:own] for each in parts])
+        for parts in ([of.mean for of in found], [of.covariance[:, :own] for of in found])
+    )
+    mean = odds @ means
+    away = means - mean
+    covariance = np.einsum("k,kij->ij", odds, spreads + away[:, :, None] * away[:, None, :])
+    squares = [float(np.sum(of.mean[own:] ** 2 + np.diag(of.covariance)[own:])) for of in found]
+    best = int(np.argmax(odds))
+    rates, number = np.unique(hypotheses[best].rate, return_inverse=True)
+    strength = np.bincount(number, found[best].mean[own:] ** 2)
+    period_s = 2 * math.pi / float(rates[np.argmax(strength)]) if len(rates) else math.nan
+    effects = Effects(mean, (covariance + covariance.T) / 2)
+    return DriveEffects(effects, hidden_nt2=float(odds @ squares) / 2, period_s=period_s)
+
+
+def effects_of_drive(
+    prior: Effects, phi: Array, y: Array, variance_nt2: Array, t: Array, *, ways: Sequence[int] = ()
+) -> DriveEffects:
     """Effects of a session from a labelled drive.
 
     Its rows are regressors (N, P), labels [nT], variances of their errors [nT^2], and ascending times [s].
+    `ways` are the columns that periodic hidden parts follow; see `magtwin.learn.mixed.hidden`.
     """
-    weight = shares(t)
+    weight, own = shares(t), phi.shape[1]
     block = ((t - t[0]) // BLOCK_S).astype(np.intp)
     if block[-1] > 0 and (t[-1] - t[0]) % BLOCK_S < BLOCK_S / 2:
         block[block == block[-1]] -= 1  # a short last block joins the one before
-    sums = [
-        sums_of(phi[at], y[at], variance_nt2[at], weight) for at in (block == k for k in np.unique(block))
-    ]
-    whole = sum(sums[1:], start=sums[0])
-    effects = posterior(prior, whole)
-    if len(sums) < 2:
-        return DriveEffects(effects, 1.0, math.nan)
+    hidden, rows = hypotheses(ways), [block == k for k in np.unique(block)]
+    tried = []
+    for k, moved in enumerate(hidden.regressors(t, phi)):
+        if k and not hidden.rate[k].any():
+            continue  # a field that wanders widens
+        more = hidden.variance[k] > 0
+        covariance = block_diag(prior.covariance, np.diag(hidden.variance[k][more]))
+        whole = Effects(np.append(prior.mean, np.zeros(more.sum())), covariance)
+        x = np.column_stack([phi, moved[:, more]])
+        sums = [sums_of(x[at], y[at], variance_nt2[at], weight) for at in rows]
+        tried.append(_Hypothesis(whole, sums, float(hidden.log_prior[k]), hidden.rate[k][more]))
+    drive = _mixture(tried, own)
+    if len(rows) < 2:
+        return drive
     error, sd = np.empty(len(y)), np.empty(len(y))
-    for k, number in enumerate(np.unique(block)):
-        at = block == number
-        others = [other for j, other in enumerate(sums) if j != k]
-        mean, variance = posterior(prior, sum(others[1:], start=others[0])).predict(phi[at])
-        error[at], sd[at] = mean - y[at], np.sqrt(variance_nt2[at] + variance)
+    for k, at in enumerate(rows):
+        others = _mixture(tried, own, left=k)
+        mean, variance = others.effects.predict(phi[at])
+        error[at], sd[at] = mean - y[at], np.sqrt(variance_nt2[at] + variance + others.hidden_nt2)
     z = quantile_factor(error, sd, block)
     widening = float(np.clip(z, LEAST_WIDENING, MOST_WIDENING))
-    return DriveEffects(effects, widening, float(np.sqrt(np.mean(error**2))))
-
-
-class FollowedEffects:
-    """Effects that change slowly, updated reading by reading: a Kalman filter.
-
-    Between readings beta is an Ornstein-Uhlenbeck process about its prior,
-
-        m <- mu + a (m - mu),   V <- a^2 V + (1 - a^2) Lambda,   a = exp(-dt / memory)
-
-    Readings closer than 1 / `RATE_HZ` to the last are skipped. An update takes some 20 us.
-    """
-
-    def __init__(
-        self,
-        prior: Effects,
-        *,
-        start: Effects | None = None,
-        memory_s: float = MEMORY_S,
-        delay_s: float = DELAY_S,
-    ) -> None:
-        """Begin at the prior.
-
-        Args:
-            prior: Effects of all sessions.
-            start: Effects to begin with, such as those of a drive. Default: the prior.
-            memory_s: Time over which effects return to their prior mean [s].
-            delay_s: Age of the newest pose when a prediction is made [s]; `widening` is that of predictions
-                made so far ahead.
-        """
-        start = start or prior
-        self.prior, self.memory_s, self.delay_s = prior, memory_s, delay_s
-        self.mean, self.covariance = start.mean.copy(), start.covariance.copy()
-        self.t = math.nan
-        """Time of the last update [s]; nan before the first."""
-        self.count = 0
-        """Number of readings used."""
-        self._past: deque[tuple[float, Effects]] = deque()
-        self._square, self._weight = 0.0, 0.0
-
-    @property
-    def widening(self) -> float:
-        """Factor of the standard deviations, by the errors of predictions `delay_s` ahead in this session."""
-        square = (WIDENING_PRIOR_S + self._square) / (WIDENING_PRIOR_S + self._weight)
-        return min(max(math.sqrt(square), LEAST_WIDENING), MOST_WIDENING)
-
-    def effects(self, t: float | None = None) -> Effects:
-        """Effects at a time [s], not before the last update. Default: at the last update."""
-        a = 1.0 if t is None or math.isnan(self.t) else math.exp(-max(t - self.t, 0.0) / self.memory_s)
-        return self._aged(a)
-
-    def due(self, t: float) -> bool:
-        """Whether a reading at a time [s] is late enough after the last one to be used."""
-        return math.isnan(self.t) or t - self.t >= 0.99 / RATE_HZ
-
-    def update(self, t: float, phi: Array, y: float, variance_nt2: float) -> bool:
-        """Use one reading with a label.
-
-        Args:
-            t: Its time [s], after that of the last update.
-            phi: Regressors, shape (P,).
-            y: Label: measured field minus the map [nT].
-            variance_nt2: Variance of the label's error [nT^2].
-
-        Returns:
-            Whether it was used; not if it is too close to the last, before it, or nan.
-        """
-        first = math.isnan(self.t)
-        step = 1 / RATE_HZ if first else t - self.t
-        if not self.due(t) or not math.isfinite(y + variance_nt2 + float(phi.sum())):
-            return False
-        weight = min(step, CORRELATION_S) / CORRELATION_S
-        if not first:
-            aged = self._aged(math.exp(-step / self.memory_s))
-            self.mean, self.covariance = aged.mean, aged.covariance
-        self._judge(t, phi, y, variance_nt2, weight)
-        turned = self.covariance @ phi
-        gain = turned / (float(phi @ turned) + variance_nt2 / weight)
-        self.mean = self.mean + gain * (y - float(phi @ self.mean))
-        self.covariance = self.covariance - np.outer(gain, turned)
-        self.covariance = (self.covariance + self.covariance.T) / 2
-        self.t, self.count = t, self.count + 1
-        if not self._past or t - self._past[-1][0] >= 1.0:
-            self._past.append((t, Effects(self.mean, self.covariance)))
-        return True
-
-    def _judge(self, t: float, phi: Array, y: float, variance_nt2: float, weight: float) -> None:
-        """Compare a label with its prediction from readings that were `delay_s` older."""
-        while len(self._past) > 1 and self._past[1][0] <= t - self.delay_s:
-            self._past.popleft()
-        if not self._past or self._past[0][0] > t - self.delay_s:
-            return
-        then, effects = self._past[0]
-        a = math.exp(-(t - then) / self.memory_s)
-        mean = float(phi @ (self.prior.mean + a * (effects.mean - self.prior.mean)))
-        spread = a * a * float(phi @ effects.covariance @ phi)
-        spread += (1 - a * a) * float(phi @ self.prior.covariance @ phi)
-        fade = math.exp(-weight * CORRELATION_S / WIDENING_MEMORY_S)
-        self._square = fade * self._square + weight * CORRELATION_S * (y - mean) ** 2 / (
-            variance_nt2 + spread
-        )
-        self._weight = fade * self._weight + weight * CORRELATION_S
-
-    def _aged(self, a: float) -> Effects:
-        mean = self.prior.mean + a * (self.mean - self.prior.mean)
-        return Effects(mean, a * a * self.covariance + (1 - a * a) * self.prior.covariance)
-
-
-def followed(
-    effects: FollowedEffects,
-    phi: Array,
-    y: Array,
-    variance_nt2: Array,
-    t: Array,
-    *,
-    predicted_nt2: Array | None = None,
-) -> tuple[Array, Array]:
-    """Predictions of the rows of a drive whose poses become known `effects.delay_s` later.
-
-    Its rows are regressors (N, P), labels [nT], nan if unknown, variances of their errors [nT^2], and
-    ascending times [s]. `predicted_nt2` are the variances of the errors to predict, by default the same.
-
-    Returns:
-        Disturbances and their standard deviations [nT], with the filter's widening, each (N,).
-    """
-    noise = variance_nt2 if predicted_nt2 is None else predicted_nt2
-    mean, sd, ready = np.empty(len(t)), np.empty(len(t)), 0
-    known = np.searchsorted(t, t - effects.delay_s, side="right")
-    starts = np.flatnonzero(np.diff(known, prepend=-1)).tolist()
-    for start, stop in itertools.pairwise([*starts, len(t)]):
-        for k in range(ready, known[start]):
-            effects.update(float(t[k]), phi[k], float(y[k]), float(variance_nt2[k]))
-        ready = int(known[start])
-        mean[start:stop], variance = effects.effects(float(t[start])).predict(phi[start:stop])
-        sd[start:stop] = effects.widening * np.sqrt(noise[start:stop] + variance)
-    return mean, sd
+    return drive._replace(widening=widening, left_out_nt=float(np.sqrt(np.mean(error**2))))

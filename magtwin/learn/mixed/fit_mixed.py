@@ -10,20 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError
+from magtwin.learn.data.features import FEATURES
 from magtwin.learn.data.inputs import Array, inputs_of
 from magtwin.learn.data.recording import Rows
 from magtwin.learn.mixed.effects import (
-    DELAY_S,
     Effects,
-    FollowedEffects,
     Sums,
     effects_of_drive,
     fit_effects,
-    followed,
     shares,
     sums_of,
     thinned_rows,
 )
+from magtwin.learn.mixed.followed import DELAY_S, FollowedEffects, followed
 from magtwin.learn.mixed.mixed import FACTORS, Mixed, mixed_of
 from magtwin.learn.models.calibration import Spread, quantile_factor
 from magtwin.learn.models.linear import fit_linear
@@ -38,7 +37,7 @@ LEAST_SESSIONS = 4
 FOLDS = 5
 """Folds of the nominal plant's sessions when factors are fitted; another plant is a fold."""
 
-MOST_JUDGED = 6
+MOST_JUDGED = 4
 """Most sessions of a fold that factors are fitted to."""
 
 
@@ -46,7 +45,7 @@ class Mixeds:
     """Linear models with effects of the session."""
 
     description = "A linear model whose coefficients differ between sessions (a mixed model)"
-    options = MappingProxyType({"features": "session", "penalty": None, "weighting": "none"})
+    options = MappingProxyType({"features": "wheels", "penalty": None, "weighting": "none"})
     load = staticmethod(mixed_of)
 
     @staticmethod
@@ -127,6 +126,8 @@ class _Fitter:
             sums_of(phi, drive.y, model.noise_nt2(phi), shares(drive.t))
             for phi, drive in zip(self.phi, drives, strict=True)
         ]
+        own = [FEATURES[name].session_sd_nt for name in model.features]
+        self.least_nt2 = np.append(0.0, (np.array(own) * model.inputs.scale) ** 2)
         nominal = iter(range(len(drives)))
         self.folds = [drive.family or f"nominal {next(nominal) % FOLDS}" for drive in drives]
 
@@ -136,6 +137,8 @@ class _Fitter:
         sums: list[Sums] = [self.sums[i] for i in chosen]
         start = np.full(len(self.model.prior.mean), self._start_nt2(chosen))
         prior, factor = fit_effects(sums, self.model.prior.mean, start_nt2=start)
+        short = np.maximum(self.least_nt2 - np.diag(prior.covariance), 0.0)
+        prior = Effects(prior.mean, prior.covariance + np.diag(short))
         noise = self.model.noise.scaled(math.sqrt(factor))
         return replace(self.model, prior=prior, session=prior, noise=noise)
 
@@ -170,11 +173,12 @@ def _judged(model: Mixed, phi: Array, drive: _Drive) -> Iterator[tuple[str, tupl
     noise = model.noise_nt2(phi)
     early = drive.t < drive.t[0] + DRIVE_S
     if not early.all():
-        session = effects_of_drive(model.prior, phi[early], drive.y[early], noise[early], drive.t[early])
+        readings = phi[early], drive.y[early], noise[early], drive.t[early]
+        session = effects_of_drive(model.prior, *readings, ways=model.ways)
         mean, variance = session.effects.predict(phi[~early])
-        sd = session.widening * np.sqrt(noise[~early] + variance)
+        sd = session.widening * np.sqrt(noise[~early] + variance + session.hidden_nt2)
         yield "calibrated", (mean - drive.y[~early], sd)
-    mean, sd = followed(FollowedEffects(model.prior), phi, drive.y, noise, drive.t)
+    mean, sd = followed(FollowedEffects(model.prior, ways=model.ways), phi, drive.y, noise, drive.t)
     later = drive.t > drive.t[0] + 2 * DELAY_S
     if later.any():
         yield "online", (mean[later] - drive.y[later], sd[later])

@@ -8,7 +8,7 @@ the session the model predicts phi' mu, afterwards phi' m with the posterior N(m
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from magtwin.errors import InputError
+from magtwin.learn.data.features import FEATURES
 from magtwin.learn.data.inputs import Array, inputs_from, scaler_tensors
 from magtwin.learn.mixed.effects import Effects, effects_of_drive
 from magtwin.learn.models.calibration import Spread, spread_from, spread_like
@@ -28,6 +29,9 @@ Intervals = Literal["nominal", "unknown", "calibrated"]
 
 FACTORS = ("calibrated", "online")
 """Ways of use that have a factor of the standard deviation, at least 1."""
+
+TOLD = 0.5
+"""Share of the errors within a session from which a hidden field is told."""
 
 
 @dataclass(kw_only=True, repr=False)
@@ -58,6 +62,9 @@ class Mixed(Predictor):
     widening: float = 1.0
     """Factor z of the standard deviation from the blocks of the session's drive."""
 
+    hidden_nt2: float = 0.0
+    """Variance of a field in the session's drive that no signal explains [nT^2]."""
+
     penalty: float = 0.0
     """Ridge penalty of mu, relative to the curvature of the rows."""
 
@@ -87,6 +94,13 @@ class Mixed(Predictor):
         z = self.inputs.scaled(self.inputs.checked(x))
         return np.column_stack([np.ones(len(z)), z])
 
+    @property
+    def ways(self) -> tuple[int, ...]:
+        """Columns of the regressors that fields fixed to the robot follow: the constant, and the
+        heading's.
+        """
+        return (0, *(1 + k for k, name in enumerate(self.features) if name in ("yaw_cos", "yaw_sin")))
+
     def noise_nt2(self, phi: Array) -> Array:
         """Variances s^2 r(x) of errors within a session [nT^2], shape (N,)."""
         return np.asarray(self.noise.sd_nt(phi[:, 1:]) ** 2)
@@ -95,14 +109,15 @@ class Mixed(Predictor):
         """Disturbances and standard deviations of their errors [nT], each (N,), from features (N, F).
 
         The standard deviation is the spread on nominal sessions; of an unknown plant
-        sqrt(s^2 r(x) + K phi' Lambda phi) with K = `families`; after a drive c z sqrt(s^2 r(x) + phi' V phi).
+        sqrt(s^2 r(x) + K phi' Lambda phi) with K = `families`; after a drive c z sqrt(s^2 r(x) + phi' V phi +
+        h), h the variance of a field that no signal explains.
         """
         phi = self.regressors(x)
         mean, variance = self.session.predict(phi)
         factor, share = self.interval_factors
         if not share:
             return mean, self.spread.sd_nt(phi[:, 1:])
-        return mean, factor * np.sqrt(self.noise_nt2(phi) + share * variance)
+        return mean, factor * np.sqrt(self.noise_nt2(phi) + share * variance + self.hidden_nt2)
 
     def wide_sd_nt(self, x: ArrayLike) -> Array | None:
         """Standard deviations on plants other than the nominal one [nT], (N,); None after a drive."""
@@ -117,6 +132,30 @@ class Mixed(Predictor):
             "calibrated": (self.factors["calibrated"] * self.widening, 1.0),
         }[self.intervals]
 
+    def reading(self, columns: Container[str]) -> "Mixed":
+        """The model without the features that a robot's columns lack.
+
+        Their effects count as errors, by what training has shown of them.
+        """
+        wanted = [set(FEATURES[name].columns) for name in self.features]
+        kept = np.array([all(column in columns for column in of) for of in wanted])
+        if kept.all():
+            return self
+        at, lost = np.append(0, 1 + np.flatnonzero(kept)), 1 + np.flatnonzero(~kept)
+        floors = np.array([FEATURES[name].session_sd_nt for name in self.features]) * self.inputs.scale
+        means = self.prior.mean[lost] ** 2
+        shown = np.maximum(np.diag(self.prior.covariance)[lost] - floors[~kept] ** 2, 0.0)
+        spread = float(np.sum(means + shown))
+        return replace(
+            self,
+            inputs=self.inputs.take(kept),
+            prior=self.prior.take(at),
+            session=self.session.take(at),
+            spread=Spread(self.spread.floor_nt2 + float(means.sum()), self.spread.slopes_nt2[kept]),
+            noise=Spread(self.noise.floor_nt2 + spread, self.noise.slopes_nt2[kept]),
+            metadata=dict(self.metadata),
+        )
+
     def open_loop(self, *, unknown_plant: bool = False) -> "Mixed":
         """The model without a drive.
 
@@ -125,7 +164,12 @@ class Mixed(Predictor):
         """
         intervals: Intervals = "unknown" if unknown_plant else "nominal"
         return replace(
-            self, session=self.prior, intervals=intervals, widening=1.0, metadata=dict(self.metadata)
+            self,
+            session=self.prior,
+            intervals=intervals,
+            widening=1.0,
+            hidden_nt2=0.0,
+            metadata=dict(self.metadata),
         )
 
     def calibrated(self, phi: Array, y: Array, t: Array, extra_nt2: Array | float = 0.0) -> "Mixed":
@@ -138,14 +182,17 @@ class Mixed(Predictor):
             extra_nt2: Variance of the labels beside `noise`, such as that of the pose [nT^2].
         """
         variance = self.noise_nt2(phi) + extra_nt2
-        drive = effects_of_drive(self.prior, phi, y, variance, t)
+        drive = effects_of_drive(self.prior, phi, y, variance, t, ways=self.ways)
         of_parent = ("residual_", "validation_", "test_")  # errors before the drive
         kept = {name: value for name, value in self.metadata.items() if not name.startswith(of_parent)}
+        if not math.isnan(drive.period_s):
+            kept["hidden_period_s"] = drive.period_s
         return replace(
             self,
             session=drive.effects,
             intervals="calibrated",
             widening=drive.widening,
+            hidden_nt2=drive.hidden_nt2,
             residual_sd_nt=drive.left_out_nt,
             metadata=kept,
         )
@@ -168,6 +215,7 @@ class Mixed(Predictor):
         return {
             "intervals": self.intervals,
             "widening": self.widening,
+            "hidden_nt2": self.hidden_nt2,
             "penalty": self.penalty,
             "families": self.families,
             **{f"factor_{name}": self.factors[name] for name in FACTORS},
@@ -192,6 +240,11 @@ class Mixed(Predictor):
                 Figure("constant of the session", constant, "nT", left),
                 Figure("interval factor of the drive", self.widening),
             ]
+            hidden = math.sqrt(self.hidden_nt2)
+            if hidden > TOLD * self.noise.mean_nt:
+                period = self.metadata.get("hidden_period_s")
+                every = f", about every {period:.0f} s" if isinstance(period, float) else ""
+                figures.append(Figure("a source that no signal explains", hidden, "nT", note=f"sd{every}"))
         return figures
 
 
@@ -237,6 +290,7 @@ def mixed_of(weights: Weights) -> Mixed:
         intervals=intervals,  # type: ignore[arg-type]
         factors={name: weights.number(f"factor_{name}", above=0.0) for name in FACTORS},
         widening=weights.number("widening", above=0.0),
+        hidden_nt2=weights.number("hidden_nt2", above=-1e-300) if "hidden_nt2" in weights.about else 0.0,
         families=int(weights.number("families", above=0.0)),
         penalty=weights.number("penalty"),
     )

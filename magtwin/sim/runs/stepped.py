@@ -46,7 +46,8 @@ Columns = dict[str, NDArray[Any]]
 
 SENSED = frozenset(
     (
-        *("t", "p_world_base", "yaw", "v_base", "w_base", "v_cmd", "w_cmd", "lidar_on", "flag_bump"),
+        *("t", "p_world_base", "yaw", "v_base", "w_base", "v_cmd", "w_cmd"),
+        *("wheel_angle", "lidar_on", "flag_bump"),
         *("odom_p", "odom_q_xyzw", "odom_v", "odom_w", "imu_q_xyzw", "imu_w", "imu_a"),
         *("battery_v", "battery_a", "battery_fraction", "b_map_nt", "b_map_gradient_nt_m"),
     )

@@ -23,6 +23,7 @@ from magtwin.learn.compensation.tolles_lawson import (
     fit_tolles_lawson,
 )
 from magtwin.path import path_named
+from magtwin.run.run import Run
 from magtwin.sim.runs.simulate import simulate
 from magtwin.spec.magnetics import EarthFieldSpec, PlatformFieldSpec
 from magtwin.spec.robot import RobotSpec
@@ -295,3 +296,51 @@ def test_the_figures_of_both_reports_are_those_of_the_raw_arrays(calibration):
     assert_allclose((compensated["b_measured_nt"] - run["b_map_nt"])[fine] - y.mean(), left, atol=1e-6)
     assert f"standard deviation {left.std():,.0f} nT against {y.std():,.0f} nT" in report.verdict
     assert f"a ratio of {left.std() / y.std():.2f}" in report.verdict
+
+
+PER_AMPERE_NT = np.array([180.0, -90.0, 60.0])
+
+
+def flight_with_motors(seconds=200.0, delay_s=0.2):
+    """Readings of a drone whose battery's current makes a field, late by `delay_s`, and that current [A]."""
+    rng, b = np.random.default_rng(1), manoeuvres(seconds)
+    t = np.arange(len(b)) / RATE_HZ
+    amperes = 12 + 6 * np.sign(np.sin(2 * np.pi * t / 17)) + 3 * np.sin(2 * np.pi * t / 5.3)
+    late = np.interp(t - delay_s, t, amperes)
+    b = b + PLATFORM.hard_iron_nt + late[:, None] * PER_AMPERE_NT
+    size = np.linalg.norm(b, axis=1) + rng.normal(0, 5.0, len(b))
+    return Run(columns={"t": t, "b_measured_nt": size, "b_vector_measured_nt": b, "battery_a": amperes}), t
+
+
+def test_the_field_of_a_battery_s_current_and_its_delay_come_back_inside_their_intervals():
+    run, _ = flight_with_motors()
+    model = fit_run(run, terms=("permanent", "induced5", "current"), band_hz=None)
+    assert model.delay_s == pytest.approx(0.2)
+    current = np.array(model.coefficients[-3:])
+    assert_allclose(current, PER_AMPERE_NT, atol=12.0)  # cosines of the disturbed field
+    assert max(model.sd[-3:]) < 20.0
+    assert model.residual_sd_nt < 30.0
+    clean, _ = compensate_run(run, model)
+    assert clean["b_measured_nt"].std() < 0.1 * run["b_measured_nt"].std()
+
+
+def test_a_saved_model_keeps_intervals_and_delay(tmp_path):
+    model = fit_run(flight_with_motors()[0], terms=("permanent", "current"), band_hz=None)
+    model.save(tmp_path / "model.json")
+    assert TollesLawson.load(tmp_path / "model.json") == model
+
+
+def test_what_a_drive_does_not_excite_is_said_to_be_undetermined_and_not_exported():
+    yaw = np.linspace(0, 12 * np.pi, 3000)
+    b = Rotation.from_euler("Z", yaw[:, None]).inv().apply(EARTH_NT)
+    size = np.linalg.norm(b + np.array(PLATFORM.hard_iron_nt), axis=1)
+    model = fit_tolles_lawson(size, b, RATE_HZ, terms=("permanent",), band_hz=None)
+    assert np.isinf(model.sd).tolist() == [False, False, True]  # on a level floor u_z is constant
+    said = {figure.name: str(figure.value) for figure in model.report("model").figures}
+    assert said["permanent z"] == "not determined: the drive does not excite it"
+    made = model.parameters("px4")
+    assert set(made) == {"CAL_MAG0_XOFF", "CAL_MAG0_YOFF"}
+    assert made["CAL_MAG0_XOFF"] == pytest.approx(415e-5, abs=2e-4)  # in gauss
+    assert made["CAL_MAG0_YOFF"] == pytest.approx(-760e-5, abs=2e-4)  # to the right
+    offset = model.parameters("ardupilot")["COMPASS_OFS_X"]
+    assert offset == pytest.approx(-4.15, abs=0.2)  # milligauss, added

@@ -38,7 +38,7 @@ def test_a_recording_comes_back_with_its_labels_to_the_last_bit(made):
         assert_allclose(run["label_sd_nt"], 20.0)
         for column in ("t", "p_world_base", "imu_q_xyzw", "battery_a", "b_measured_nt", "b_truth_nt"):
             assert_array_equal(run[column], before[column])
-        assert "wheel_angle" not in run
+        assert "v_base" not in run  # the truth is no signal
         assert one.labelled == run.rows == one.rows
 
 

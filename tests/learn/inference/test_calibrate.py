@@ -8,15 +8,16 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import magtwin as mt
 from magtwin.cli import main
-from magtwin.errors import InputError
+from magtwin.errors import CalibrationWarning, InputError
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.files.file import sha256
+from magtwin.files.file import sha256, shipped
 from magtwin.learn.data.features import features
 from magtwin.learn.inference.calibrate import labelled_drive
 from magtwin.learn.inference.magnetometer import NeuralMagnetometer
 from magtwin.learn.inference.online import OnlineMagnetometer, read_online
 from magtwin.learn.models.linear import fit_linear
 from magtwin.learn.models.predictor import load_predictor
+from magtwin.path import loops
 from magtwin.report.verdict import OF_DRIVE, OTHERS, OWN
 from magtwin.run.run import Run
 
@@ -183,11 +184,10 @@ def test_what_cannot_calibrate_is_refused_in_a_line(model, weights, tmp_path):
     simulated = Run(dict(run), {"magnetometer": "neural"})
     (tmp_path / "there.safetensors").write_bytes(b"")
     for refused, options, text in (
-        (linear, {}, "kind 'linear' has no effects of a session; train one with --model mixed"),
+        (linear, {}, "kind 'linear' has no effects of a session; take the one that ships"),
         (model, {"duration_s": 2.0}, "labelled readings at most 4 a second, and 20 are needed"),
         (model, {"run": far}, "none of 600 readings has a label on the map"),
         (model, {"run": simulated}, "its readings come from a neural magnetometer"),
-        (model, {"run": run.select("t", "p_world_base", "yaw", "b_measured_nt")}, "no column 'odom_v'"),
         (model, {"pose_sd_m": -1.0}, "pose_sd_m must be between 0 and 1000 m, got -1.0"),
         (weights, {"out": tmp_path / "there.safetensors"}, "exists"),
     ):
@@ -195,6 +195,41 @@ def test_what_cannot_calibrate_is_refused_in_a_line(model, weights, tmp_path):
             mt.calibrate(refused, options.pop("run", run), anomaly_map=FIELD, **options)
         assert text in str(error.value)
         assert "\n" not in str(error.value)
+
+
+def test_a_drive_that_lacks_a_signal_calibrates_without_it_and_says_so(model):
+    held = []
+    for seed in range(200, 220):
+        whole = a_run(seed, "hysteresis", seconds=120.0)
+        run = whole.select(*(name for name in whole if name != "odom_v"))
+        with pytest.warns(CalibrationWarning, match="it has no odom_v; what they would show counts as error"):
+            calibrated = mt.calibrate(model, run, anomaly_map=FIELD, duration_s=60.0)
+        assert calibrated.features == ("yaw_sin", "yaw_cos")
+        error, sd = (values[run["t"] > 60] for values in errors(calibrated, run))
+        assert np.abs(error).mean() < 60 < np.abs(errors(model, whole)[0]).mean() + 60
+        held.append(np.mean(np.abs(error) < 1.645 * sd))
+    assert np.mean(held) > 0.85
+
+
+def test_the_model_that_ships_learns_a_load_on_board_and_turning_wheels_in_a_minute():
+    """Neither is in its training: a magnet of 700 nT, and wheels of 150 nT."""
+
+    def field(columns, robot, rng):
+        angle = columns["wheel_angle"]
+        turning = [150 * np.cos(angle[:, 0]), 0 * angle[:, 0], 150 * np.sin(angle[:, 1])]
+        return np.add(np.column_stack(turning), (400.0, -300.0, -500.0))
+
+    way = loops().at(np.linspace(0, 17, 700))
+    options = {"magnetometer": "physical", "rate_hz": 8.0, "seed": 5, "interference": [field]}
+    run, lab = mt.simulate("lab", way, **options), mt.load_map(shipped("maps", "lab", "lab.usdc"))
+    today = mt.calibrate(None, run, anomaly_map=lab, duration_s=60.0)
+    drive = labelled_drive(today, run, lab)
+    late = (drive.t > 60) & np.isfinite(drive.y)
+    before, after = (
+        np.abs(each.predict(drive.x)[0] - drive.y)[late].mean() for each in (today.open_loop(), today)
+    )
+    assert after < before / 4
+    assert after < 110
 
 
 def test_told_of_poses_that_are_off_it_errs_less_and_says_so(model):

@@ -8,15 +8,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from magtwin.learn.mixed.effects import (
     CORRELATION_S,
-    MEMORY_S,
     Effects,
-    FollowedEffects,
     effects_of_drive,
     fit_effects,
     posterior,
     shares,
     sums_of,
 )
+from magtwin.learn.mixed.followed import MEMORY_S, FollowedEffects, followed
 
 P = 5
 
@@ -119,7 +118,7 @@ def test_followed_effects_are_regression_with_the_kernel_of_their_process():
     whole = kernel_of_time(prior, phi, t, phi, t) + np.diag(variance / weight)
     mean = at @ prior.mean + cross @ np.linalg.solve(whole, y - phi @ prior.mean)
     spread = at @ prior.covariance @ at.T - cross @ np.linalg.solve(whole, cross.T)
-    found = filtered.effects(later[0]).predict(at)
+    found = filtered.predict(later, at)
     assert_allclose(found[0], mean, rtol=1e-6)
     assert_allclose(found[1], np.diag(spread), rtol=1e-6)
 
@@ -149,3 +148,61 @@ def test_errors_larger_than_thought_widen_what_follows():
 
     assert widening(20.0) == pytest.approx(1.0, abs=0.15)
     assert widening(60.0) == pytest.approx(2.7, abs=0.5)  # a prior of 30 s pulls towards 1
+
+
+WAYS = (0, 1, 2)
+"""Columns of the constant, cosine and sine of the heading in `a_turning_drive`."""
+
+
+def a_turning_drive(prior, hidden_nt, seconds=300.0, noise_nt=20.0, seed=0):
+    """Rows at 4 Hz of a robot that turns, with a hidden field, (N, 3), that is fixed to it."""
+    rng, t = np.random.default_rng(seed), np.arange(0.0, seconds, 0.25)
+    yaw = np.cumsum(0.3 * rng.normal(size=len(t)))
+    phi = np.column_stack([np.ones(len(t)), np.cos(yaw), np.sin(yaw), rng.normal(size=(len(t), P - 3))])
+    y = phi @ prior.mean + np.sum(phi[:, WAYS] * hidden_nt(t), axis=1) + noise_nt * rng.normal(size=len(t))
+    return phi, y, np.full(len(t), noise_nt**2), t
+
+
+def tilting(t):
+    """A part that swings every 33 s, a period between those of the hypotheses, and rests at both ends."""
+    swing = np.clip(1.4 * np.sin(2 * np.pi * t / 33.0 + 1.0), -1, 1)
+    return swing[:, None] * [150.0, 60.0, -80.0]
+
+
+def test_a_part_that_swings_is_predicted_from_its_past():
+    prior = a_prior(size=10.0)
+    phi, y, variance, t = a_turning_drive(prior, tilting)
+    late = t > 120
+    (blind, _), (seen, sd) = (
+        followed(FollowedEffects(prior, ways=ways), phi, y, variance, t) for ways in ((), WAYS)
+    )
+    error, without = (float(np.sqrt(np.mean((m - y)[late] ** 2))) for m in (seen, blind))
+    assert error < 0.55 * without  # without it the last ten seconds are a third of a swing behind
+    assert 0.85 < np.mean(np.abs((seen - y)[late]) < 1.645 * sd[late]) <= 1.0
+
+
+def test_without_a_hidden_part_none_is_found():
+    prior = a_prior(size=10.0)
+    phi, y, variance, t = a_turning_drive(prior, lambda t: np.zeros((len(t), 3)))
+    filtered = FollowedEffects(prior, ways=WAYS)
+    followed(filtered, phi, y, variance, t)
+    assert np.argmax(filtered.probabilities) == 0
+    assert effects_of_drive(prior, phi, y, variance, t, ways=WAYS).hidden_nt2 < 20.0**2 / 4
+
+
+def test_a_drive_tells_period_and_size_of_a_field_that_no_signal_explains():
+    prior = a_prior(size=10.0)
+    phi, y, variance, t = a_turning_drive(prior, tilting, seconds=120.0)
+    drive = effects_of_drive(prior, phi, y, variance, t, ways=WAYS)
+    assert drive.period_s == pytest.approx(33.0, rel=0.08)  # the hypotheses are 7 % apart
+    truth = np.sqrt(np.mean(np.sum(phi[:, WAYS] * tilting(t), axis=1) ** 2))
+    assert np.sqrt(drive.hidden_nt2) == pytest.approx(truth, rel=0.35)
+
+
+def test_a_field_that_jumps_at_no_period_widens_the_intervals():
+    prior, rng = a_prior(size=10.0), np.random.default_rng(4)
+    jumps = np.repeat(rng.normal(size=(40, 3)), 60, axis=0)
+    phi, y, variance, t = a_turning_drive(prior, lambda t: 120.0 * jumps[: len(t)])
+    mean, sd = followed(FollowedEffects(prior, ways=WAYS), phi, y, variance, t)
+    late = t > 60
+    assert 0.8 < np.mean(np.abs((mean - y)[late]) < 1.645 * sd[late]) < 0.98
