@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from magtwin.bench.case import Case
+from magtwin.bench.sealed import Contestant, foreign, seals, seed_of
 from magtwin.bench.suite import Chunk, Entry, Scenario, Suite
 from magtwin.errors import InputError
 from magtwin.localization.bounds import Bounds, bounds
@@ -75,9 +76,12 @@ def run_chunk(
             key = {"scenario": scenario.name, "localizer": name, "run": run}
             beat(f"{run} {name}")
             if failures and (run, name) in failures:
-                made, scores = None, Scores(failed=failures[run, name])
+                made, scores, smooth = None, Scores(failed=failures[run, name]), False
             else:
-                made, scores = run_localizer(entry, case, suite.time_limit_s, limits, scenario)
+                seed = case.problem.seed
+                if foreign(entry.method):
+                    seed = seed_of(suite.sha256, scenario.name, suite.first_seed + run, name)
+                made, scores, smooth = run_localizer(entry, case, suite.time_limit_s, limits, scenario, seed)
             row = scores.row()
             times.append({**key, "step_us": row.pop("step_us")})
             reason = row.pop("failed")
@@ -89,7 +93,7 @@ def run_chunk(
                     "status": "failed" if reason else "ok",
                     "reason": reason,
                     "readings": case.readings.rows,
-                    "smoother": smooths(entry),
+                    "smoother": smooth,
                     "global_start": scenario.prior != "tracking",
                     "recovered_in_time": sum(after <= WITHIN_S for after in scores.recovery_s),
                     **row,
@@ -148,9 +152,19 @@ def bounds_of(case: Case) -> Bounds | None:
 
 
 def run_localizer(
-    entry: Entry, case: Case, limit_s: float, limits: Bounds | None, scenario: Scenario
-) -> tuple[Track | None, Scores]:
-    """A track and its scores; None and the reason if the localizer failed."""
+    entry: Entry, case: Case, limit_s: float, limits: Bounds | None, scenario: Scenario, seed: int
+) -> tuple[Track | None, Scores, bool]:
+    """A track, its scores, and whether it is a smoother's; None and the reason if the localizer failed.
+
+    Args:
+        entry: The localizer, which runs in a jailed process of its own if its code is not magtwin's.
+        case: The case.
+        limit_s: Longest time [s].
+        limits: Bounds of the case.
+        scenario: What the case was drawn from.
+        seed: Seed of the localizer's random numbers.
+    """
+    contestant, smooth = None, False
     try:
         with time_limit(limit_s):
             readings = case.readings
@@ -158,35 +172,45 @@ def run_localizer(
                 from magtwin.tasks.own_field import with_own_field
 
                 readings = with_own_field(readings, entry.compensator, case.problem)
-            made = track(load_localizer(entry.method, entry.options), case.problem, readings)
+        if seals(entry.method):
+            contestant = Contestant(entry, case.problem, seed, readings, limit_s)
+        with time_limit(limit_s):
+            if contestant is not None:
+                smooth = contestant.load().smooths
+                made = track(contestant, case.problem, readings, name=contestant.name)
+                made = replace(made, step_s=contestant.step_s)
+            else:
+                algorithm = load_localizer(entry.method, entry.options)
+                smooth = smooths(algorithm)
+                made = track(algorithm, replace(case.problem, seed=seed), readings)
     except (InputError, MemoryError) as error:
-        return None, Scores(failed=str(error))
-    except TimeLimitError:
-        return None, Scores(failed=f"took longer than the time limit of {limit_s:g} s")
-    return made, score(
+        return None, Scores(failed=str(error)), smooth
+    except (TimeLimitError, TimeoutError):
+        return None, Scores(failed=f"took longer than the time limit of {limit_s:g} s"), smooth
+    finally:
+        if contestant is not None:
+            contestant.end()
+    scores = score(
         made,
         case.truth.pose,
         global_start=scenario.prior != "tracking",
         kidnapped_s=case.truth.kidnapped_s,
         bounds=limits,
     )
+    return made, scores, smooth
 
 
-def smooths(entry: Entry) -> bool:
+def smooths(algorithm: Localizer | Smoother) -> bool:
     """Whether an algorithm uses later readings for its estimates, and so has another bound."""
-    try:
-        algorithm = load_localizer(entry.method, entry.options)
-    except InputError:
-        return False
     return isinstance(algorithm, Smoother) and not isinstance(algorithm, Localizer)
 
 
 def _warm_up(entry: Entry, case: Case) -> None:
     """Run a localizer of magtwin on a few readings once, so that no run's time has compilation in it.
 
-    Localizers that are given as MODULE:CLASS are left alone: what they do wrong counts in their runs.
+    Those of others are left alone: what they do wrong counts in their runs.
     """
-    if ":" in entry.method or repr(entry) in _warm:
+    if foreign(entry.method) or repr(entry) in _warm:
         return
     _warm.add(repr(entry))
     with contextlib.suppress(InputError):  # which its runs will say

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from magtwin.bench import results
+from magtwin.bench import results, sealed
 from magtwin.bench.results import Results, Run, runs_of
 from magtwin.bench.row import SETUP, Row, run_chunk
 from magtwin.bench.suite import Chunk, Seeds, Suite, load_suite, suite_file
@@ -85,7 +85,10 @@ def benchmark(
     file, out = suite_file(suite), Path(out)
     whole = load_suite(file)
     chosen = whole.limited(scenarios=scenarios, localizers=localizers, runs=runs, seeds=seeds, data=data)
-    chosen.check(file)
+    try:
+        chosen.check(file, sealed.check_localizer)
+    finally:
+        sealed.close()
     if shard is not None:
         checked_shard(shard)
         if force:

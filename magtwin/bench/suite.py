@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
@@ -325,11 +325,16 @@ class Suite:
             data={**self.data, **(data or {})},
         )
 
-    def check(self, file: str | os.PathLike[str] = "") -> None:
+    def check(
+        self,
+        file: str | os.PathLike[str] = "",
+        make: Callable[[str, Mapping[str, Any]], Any] = load_localizer,
+    ) -> None:
         """Make every localizer and compensator once, and look for scenes, paths and data.
 
         Args:
             file: The suite's file, for error messages. Default: not named.
+            make: Makes a localizer by its method and options.
 
         Raises:
             InputError: There is no localizer; one is unknown or refuses its options; or a scene, a path or
@@ -344,7 +349,7 @@ class Suite:
             with _named_in(file, "localizer", entry.name, ("options", "compensator", "method")):
                 from magtwin.localization.compensators import COMPENSATORS, is_weights
 
-                load_localizer(entry.method, entry.options)
+                make(entry.method, entry.options)
                 if is_weights(entry.compensator):
                     existing(self.path(entry.compensator), "weights file")
                 else:
