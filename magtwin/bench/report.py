@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from magtwin.bench.leaderboard import Columns, Difference, Standing, compare_rows, standings
 from magtwin.bench.results import read_results
 from magtwin.bench.statistics import Interval, Paired
-from magtwin.bench.suite import Scenario
+from magtwin.bench.suite import SIMULATED, Scenario
 from magtwin.figures.canvas import Chart, label, legend_above
 from magtwin.figures.page import Page, Section, Table, write_pages
 from magtwin.figures.style import INK, SERIES, SOFT
@@ -178,7 +178,7 @@ def _described(scenario: Scenario, here: Sequence[Standing], rows: Columns) -> s
 def describe(scenario: Scenario) -> str:
     """A scenario in words: its size, and the keys of a suite that differ from their defaults."""
     size = f"{_count(scenario.runs, 'run')} of recorded data."
-    if scenario.source == "twin":
+    if scenario.source in SIMULATED:
         sessions = _count(min(scenario.runs, scenario.sessions), "session")
         size = f"{_count(scenario.runs, 'run')} of {scenario.duration_s:g} s in {sessions}."
     keys = [key for key in _changed(scenario) if key[0] not in ("name", "runs", "sessions", "duration_s")]

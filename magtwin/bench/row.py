@@ -3,7 +3,7 @@
 import contextlib
 import signal
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -13,12 +13,13 @@ import numpy as np
 
 from magtwin.bench.case import Case
 from magtwin.bench.sealed import Contestant, foreign, seals, seed_of
+from magtwin.bench.store import ROWS, SCHEMAS, TIMES, TRACKS, TRUTHS
 from magtwin.bench.suite import Chunk, Entry, Scenario, Suite
 from magtwin.errors import InputError
 from magtwin.localization.bounds import Bounds, bounds
 from magtwin.localization.localizers import load_localizer
 from magtwin.localization.problem import Localizer, Smoother
-from magtwin.localization.scores import Scores, score
+from magtwin.localization.scores import SCALE_M, Scores, score
 from magtwin.localization.track import Track, track
 from magtwin.parallel import beat
 
@@ -46,7 +47,8 @@ def run_chunk(
     chunk: Chunk,
     fields: Path | None = None,
     failures: Mapping[tuple[int, str], str] | None = None,
-) -> tuple[list[Row], list[Row], list[Row]]:
+    done: Collection[tuple[int, str]] = (),
+) -> dict[str, list[Row]]:
     """Run and score a chunk of a suite.
 
     Args:
@@ -55,37 +57,40 @@ def run_chunk(
         fields: Folder with a folder of `magtwin.bench.world.fit_field` for each survey in the suite's data.
         failures: Reasons by run and localizer of those that are known to fail and are not run, as they would
             end the process.
+        done: Runs and localizers to leave out.
 
     Returns:
-        Rows of the results, one per run and localizer; rows with the processor times of the same runs; and
-        rows with their errors over time. All but the times are the same in every call.
+        Rows by kind of table in `magtwin.bench.store`. All but the times are the same in every call.
     """
     scenario = suite.scenarios[chunk.scenario]
-    rows: list[Row] = []
-    times: list[Row] = []
-    tracks: list[Row] = []
+    made: dict[str, list[Row]] = {kind: [] for kind in SCHEMAS}
     for run in range(chunk.first, chunk.first + chunk.runs):
+        names = [name for name in chunk.entries if (run, name) not in done]
+        if not names:
+            continue
         beat(f"{run}", times=SETUP)
         case = make_case(suite, scenario, run, fields)
         limits = bounds_of(case)
-        for name in chunk.entries:
+        made[TRUTHS].append({"scenario": scenario.name, "run": run, **_bound_over_time(case, limits)})
+        for name in names:
             _warm_up(suite.localizers[name], case)
-        for name in chunk.entries:
+        for name in names:
             entry = suite.localizers[name]
             entry = replace(entry, compensator=suite.path(entry.compensator))
             key = {"scenario": scenario.name, "localizer": name, "run": run}
             beat(f"{run} {name}")
             if failures and (run, name) in failures:
-                made, scores, smooth = None, Scores(failed=failures[run, name]), False
+                found, scores, smooth = None, Scores(failed=failures[run, name]), False
             else:
                 seed = case.problem.seed
-                if foreign(entry.method):
-                    seed = seed_of(suite.sha256, scenario.name, suite.first_seed + run, name)
-                made, scores, smooth = run_localizer(entry, case, suite.time_limit_s, limits, scenario, seed)
+                if foreign(entry.method) or scenario.source == "drawn":
+                    salt = bytes.fromhex(suite.salt)
+                    seed = seed_of(suite.sha256, scenario.name, suite.first_seed + run, name, salt)
+                found, scores, smooth = run_localizer(entry, case, suite.time_limit_s, limits, scenario, seed)
             row = scores.row()
-            times.append({**key, "step_us": row.pop("step_us")})
+            made[TIMES].append({**key, "step_us": row.pop("step_us")})
             reason = row.pop("failed")
-            rows.append(
+            made[ROWS].append(
                 {
                     **key,
                     "seed": suite.first_seed + run,
@@ -99,8 +104,8 @@ def run_chunk(
                     **row,
                 }
             )
-            tracks.append({**key, **_over_time(case, made, limits)})
-    return rows, times, tracks
+            made[TRACKS].append({**key, **_over_time(case, found)})
+    return made
 
 
 def make_case(suite: Suite, scenario: Scenario, run: int, fields: Path | None = None) -> Case:
@@ -113,6 +118,10 @@ def make_case(suite: Suite, scenario: Scenario, run: int, fields: Path | None = 
         session = suite.first_seed + run % scenario.sessions
         scenario = replace(scenario, paths=tuple(map(suite.path, scenario.paths)))
         return twin_case(scenario, str(suite.scene(scenario)), seed, session, own)
+    if scenario.source == "drawn":
+        from magtwin.bench.drawn import drawn_case
+
+        return drawn_case(scenario, seed, suite.salt)
     folder = suite.folder(scenario)
     if scenario.source == "magnetic-data":
         from magtwin.bench.magnetic_data import magnetic_data_case
@@ -196,6 +205,7 @@ def run_localizer(
         global_start=scenario.prior != "tracking",
         kidnapped_s=case.truth.kidnapped_s,
         bounds=limits,
+        scale_m=SCALE_M if case.truth.scale_m is None else case.truth.scale_m,
     )
     return made, scores, smooth
 
@@ -236,18 +246,20 @@ def time_limit(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def _over_time(case: Case, made: Track | None, limits: Bounds | None) -> Row:
-    """Time, position error, bound and flag at `TRACK_HZ`, as float32."""
+def _over_time(case: Case, made: Track | None) -> Row:
+    """Position error and flag at `TRACK_HZ`, as float32."""
     truth = case.truth
-    every = max(1, round(case.problem.rate_hz / TRACK_HZ))
-    rows = slice(None, None, every)
     unknown = np.full(len(truth.t), np.nan)
     error = unknown if made is None else np.hypot(*(made.pose - truth.pose)[:, :2].T)
-    lost = unknown if made is None else made.lost
-    arrays = {
-        "t": truth.t - truth.t[0],
-        "error_m": error,
-        "bound_m": unknown if limits is None else limits.correlated,
-        "lost": lost,
-    }
-    return {name: np.asarray(values[rows], np.float32) for name, values in arrays.items()}
+    return _thinned(case, error_m=error, lost=unknown if made is None else made.lost)
+
+
+def _bound_over_time(case: Case, limits: Bounds | None) -> Row:
+    t = case.truth.t
+    bound = np.full(len(t), np.nan) if limits is None else limits.correlated
+    return _thinned(case, t=t - t[0], bound_m=bound)
+
+
+def _thinned(case: Case, **curves: Any) -> Row:
+    rows = slice(None, None, max(1, round(case.problem.rate_hz / TRACK_HZ)))
+    return {name: np.asarray(values[rows], np.float32) for name, values in curves.items()}

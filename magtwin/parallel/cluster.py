@@ -83,6 +83,7 @@ class Cluster:
         *,
         limit_s: Limit = None,
         progress: Callable[[int, int], Any] | None = None,
+        heard: Callable[[int, str], Any] | None = None,
     ) -> Iterator[Outcome[R]]:
         """As `Pool.run`; the limit of a chunk is what `limit_s` gives when the chunk is sent."""
         from distributed import as_completed

@@ -78,6 +78,7 @@ class Pool(Protocol):
         *,
         limit_s: Limit = None,
         progress: Callable[[int, int], Any] | None = None,
+        heard: Callable[[int, str], Any] | None = None,
     ) -> Iterator[Outcome[R]]:
         """Call a function for every chunk; gives the outcomes in any order.
 
@@ -87,6 +88,7 @@ class Pool(Protocol):
             limit_s: Longest time of a chunk [s]. A function of a chunk is asked again and again, so that it
                 can follow the times seen so far. Default: no limit.
             progress: Called with the chunks done and all chunks.
+            heard: Called with the number of a chunk and what its function says to `beat`; on this machine.
 
         Raises:
             InputError: Workers cannot start, or the cluster does not fit.
