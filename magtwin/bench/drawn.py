@@ -8,7 +8,7 @@ import hashlib
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,9 +107,10 @@ def place(number: int, salt: str) -> Place:
     floor, standing = np.zeros((3, rows, columns)), np.zeros((3, rows, columns))
     main = rng.normal(size=3) + np.array([0.0, 0.0, -2.0])  # most iron is magnetised alike
 
-    def iron(sheet: Array, at: Array, strength: float) -> None:
+    def iron(sheet: Array, at: NDArray[Any], strength: float) -> None:
         moment = strength * (main + rng.normal(size=(len(at), 3))) * rng.lognormal(0, 0.5, (len(at), 1))
-        np.add.at(sheet, (slice(None), at[:, 1], at[:, 0]), moment.T)
+        for part, moments in zip(sheet, moment.T, strict=True):
+            np.add.at(part, tuple(at[:, ::-1].T), moments)
 
     def spots(count: float) -> Array:
         return np.column_stack([rng.integers(n, size=max(1, round(count))) for n in (columns, rows)])
@@ -137,7 +138,8 @@ def place(number: int, salt: str) -> Place:
             for y in np.arange(begin[1], sides[1], kind.columns):
                 stand(x, y, 0.4, 0.4, 2.0)
     for _ in range(round(kind.furniture * area)):
-        stand(*rng.uniform(0, sides), *rng.uniform(0.4, 1.6, 2), rng.choice([0.2, 1.2]))
+        (x, y), (wide, deep) = rng.uniform(0, sides), rng.uniform(0.4, 1.6, 2)
+        stand(x, y, wide, deep, rng.choice([0.2, 1.2]))
     for y in np.arange(kind.rows, sides[1] - kind.rows / 2, kind.rows) if kind.rows else ():
         gap = rng.uniform(0.3, 0.7) * sides[0]  # a way through
         for x0, x1 in ((2.5, gap - 1.5), (gap + 1.5, sides[0] - 2.5)):

@@ -1,6 +1,5 @@
 """Runner: the chunks of a suite on processes, shards and clusters, into a folder of results."""
 
-import hashlib
 import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -13,6 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.bench import results, sealed, store
+from magtwin.bench.receipt import (
+    differences,
+    folder_sha256,
+    read_receipt,
+    rows_sha256,
+    sample,
+    write_receipt,
+)
 from magtwin.bench.results import Results
 from magtwin.bench.row import SETUP, Row, run_chunk
 from magtwin.bench.suite import SIMULATED, Chunk, Seeds, Suite, load_suite, suite_file
@@ -21,6 +28,7 @@ from magtwin.files.file import sha256, shipped
 from magtwin.files.outputs import output
 from magtwin.localization.compensators import is_weights
 from magtwin.parallel import Failure, Pool, beat, checked_shard, open_pool
+from magtwin.report.report import Figure, Report
 from magtwin.version import __version__
 
 GRACE_S = 60.0
@@ -165,7 +173,72 @@ def benchmark(
         if plan:
             with store.Journal(out, order) as journal:
                 _run(pool, chosen, plan, out, journal, tracks, progress or (lambda done, total, what: None))
-    return replace(results.results_in(out), new=plan.size)
+    with store.alone(out):
+        made = replace(results.results_in(out), new=plan.size)
+        write_receipt(out, made.about, chosen, made.rows)
+    return made
+
+
+def verify(
+    receipt: str | os.PathLike[str],
+    *,
+    suite: str | os.PathLike[str] | None = None,
+    runs: int = 12,
+    salt: str = "",
+    data: Mapping[str, str] | None = None,
+    jobs: int | None = None,
+) -> Report:
+    """Make a sample of the runs of results again, and compare all values of their rows.
+
+    Args:
+        receipt: Receipt in a folder of results, or the folder.
+        suite: The suite. Default: the copy in that folder; one with files of its own needs its own folder.
+        runs: Number of runs in the sample, each by all of its localizers.
+        salt: As for `benchmark`.
+        data: As for `benchmark`.
+        jobs: As for `benchmark`.
+
+    Raises:
+        InputError: It is no receipt or of another version, the rows or the suite are not those of the
+            receipt, or a localizer is missing here.
+    """
+    told = read_receipt(receipt)
+    folder = Path(receipt) if Path(receipt).is_dir() else Path(receipt).parent
+    there = results.read_results(folder)
+    if rows_sha256(there.rows) != told["rows"]["sha256"]:
+        raise InputError(f"{folder}: the rows are not those of the receipt; they were changed or added to")
+    names = list(dict.fromkeys(there.rows["localizer"].tolist()))
+    file = folder / results.SUITE if suite is None else suite_file(suite)
+    whole = load_suite(file).limited(seeds=there.about["seeds"], salt=salt, data=data)
+    if whole.sha256 != told["suite"]["sha256"]:
+        raise InputError(f"{file}: not the suite of the receipt; give that by `suite`", parameter="suite")
+    chosen = whole.limited(localizers=names, seeds=whole.seeds, salt=salt)
+    try:
+        chosen.check(file, sealed.check_localizer)
+    finally:
+        sealed.close()
+    drawn = sample(there.rows, runs, told["rows"]["sha256"])
+    tasks = [
+        Task(Chunk(scenario=scenario, part=0, first=run, runs=1, entries=entries))
+        for scenario, run, entries in drawn
+    ]
+    with open_pool(jobs) as pool:
+        work = partial(run_task, chosen, _fields(chosen, folder))
+        limit_s = 2 * chosen.time_limit_s + GRACE_S
+        made = [outcome.result() for outcome in pool.run(work, tasks, limit_s=limit_s)]
+    wrong = [said for each in made for said in differences(there.rows, each)]
+    count = sum(len(entries) for *_, entries in drawn)
+    kinds = told["localizers"]
+    return Report(
+        f"{folder}: {'the sample is as it was' if not wrong else 'NOT the same rows'}",
+        (
+            Figure("rows", told["rows"]["count"]),
+            Figure("made again", count),
+            Figure("different", len(wrong)),
+            Figure("not sealed", sum(kind == "not sealed" for kind in kinds.values())),
+        ),
+        {"differences": dict(enumerate(wrong))} if wrong else {},
+    )
 
 
 def about(whole: Suite, chosen: Suite) -> dict[str, Any]:
@@ -178,19 +251,6 @@ def about(whole: Suite, chosen: Suite) -> dict[str, Any]:
         "magtwin": __version__,
         "data": {name: folder_sha256(folder) for name, folder in _data(chosen).items()} | _inputs(chosen),
     }
-
-
-def folder_sha256(folder: Path, pattern: str = "*") -> str:
-    """SHA-256 of the files of a folder that match `pattern`, and their names; hidden files do not count."""
-    sum_ = hashlib.sha256()
-    for file in sorted(folder.rglob(pattern)):
-        inside = file.relative_to(folder)
-        if file.is_file() and not any(part.startswith(".") for part in inside.parts):
-            with open(file, "rb") as content:
-                sum_.update(
-                    f"{inside.as_posix()} {hashlib.file_digest(content, 'sha256').hexdigest()}\n".encode()
-                )
-    return sum_.hexdigest()
 
 
 def _data(suite: Suite) -> dict[str, Path]:

@@ -173,8 +173,8 @@ def _lock(file: int, *, wait: bool) -> bool:
 
 
 @contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Wait until no other program puts journals of a folder into parts."""
+def alone(folder: Path) -> Iterator[None]:
+    """Wait until no other program changes the parts of a folder or its receipt, and keep it so."""
     if os.name == "nt":  # folders cannot be opened there
         yield
         return
@@ -188,7 +188,7 @@ def _alone(folder: Path) -> Iterator[None]:
 
 def merge(folder: Path, order: Order) -> None:
     """Put the journals that no program writes any more into parts, and remove them."""
-    with _alone(folder):
+    with alone(folder):
         for file in sorted(folder.glob("journal-*.log")):
             with contextlib.suppress(FileNotFoundError), open(file, "rb") as journal:
                 if not _lock(journal.fileno(), wait=False):
