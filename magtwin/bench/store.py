@@ -208,7 +208,8 @@ def _into_parts(folder: Path, kind: str, table: pa.Table, order: Order) -> None:
             old = [_part(path, kind)] if path.is_file() else []
             sink = pa.BufferOutputStream()
             whole = order.sorted(pa.concat_tables([*old, new])).combine_chunks()
-            pq.write_table(whole, sink, compression="zstd")
+            # without a schema of Arrow, which tells how a table was made
+            pq.write_table(whole, sink, compression="zstd", store_schema=False)
             write_file(path, sink.getvalue().to_pybytes())
 
 

@@ -162,8 +162,8 @@ def test_a_repeat_runs_what_is_missing_only(warm, suite, whole, tmp_path, monkey
 def test_localizers_that_fail_in_any_way_have_rows_and_the_suite_goes_on(warm, tmp_path, monkeypatch):
     monkeypatch.setattr(runner, "GRACE_S", 4.0)
     reasons = {
-        "Hangs": "took longer than its time limit, and did not stop",
-        "Crashes": "the process was killed by SIGSEGV, 3 times",
+        "Hangs": "took longer than",
+        "Crashes": "the process was killed by SIGSEGV",
         "Exits": "raised SystemExit at t = ",
         "Nan": "not finite",
         "Future": "from the future",
