@@ -65,6 +65,11 @@ def main(control: socket.socket) -> None:
     for module in setup["modules"]:
         with contextlib.suppress(ImportError):
             importlib.import_module(module)
+    if "numba" in sys.modules:
+        from numba.core.dispatcher import Dispatcher
+
+        # numba refuses what cannot be cached, and in a jail nothing can
+        Dispatcher.enable_caching = lambda self: None  # type: ignore[method-assign]
     ruleset = jail.readable(jail.libraries([Path(each) for each in setup["hidden"]]))
     with open(os.devnull, "r+b") as null:
         for stream in range(3):

@@ -231,15 +231,15 @@ def _overview(every: Sequence[Standing]) -> Table:
             if s is None or s.rmse_m is None:
                 cells.append("" if s is None else "failed")
             else:
-                cells.append(f"{s.rmse_m.value:.3f}" + (f" ({s.bound_m:.3f})" if s.bound_m > 0 else ""))
+                bound = f" ({s.median_bound_m:.3f})" if s.bound_m > 0 else ""
+                cells.append(f"{s.median_m:.3f}{bound}")
         rows.append((name, *cells))
-    return Table("RMSE of the position, and its bound [m]", ("localizer", *scenarios), tuple(rows))
+    return Table("Median RMSE of a run, and median bound [m]", ("localizer", *scenarios), tuple(rows))
 
 
 def _accuracy(here: Sequence[Standing], same: Mapping[str, str]) -> Table:
     head = (
         "localizer",
-        "equal",
         "runs",
         "median [m]",
         "RMSE [m]",
@@ -252,9 +252,8 @@ def _accuracy(here: Sequence[Standing], same: Mapping[str, str]) -> Table:
     rows = [
         (
             s.localizer,
-            same.get(s.localizer, ""),
             s.runs,
-            _interval(s.median),
+            f"{_interval(s.median)} {same.get(s.localizer, '')}".strip(),
             _interval(s.rmse_m),
             _number(s.p95_m),
             _number(s.bound_m),
@@ -264,7 +263,7 @@ def _accuracy(here: Sequence[Standing], same: Mapping[str, str]) -> Table:
         )
         for s in here
     ]
-    note = "equal: localizers with a letter in common could not be told apart (paired runs, p 0.05)."
+    note = "Localizers with a letter in common could not be told apart (paired runs, p 0.05)."
     return Table("Accuracy", head, tuple(rows), note)
 
 

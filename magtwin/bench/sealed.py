@@ -291,7 +291,9 @@ def check_localizer(method: str, options: Mapping[str, Any]) -> None:
     columns = {"t": np.arange(2.0), "b_measured_nt": nothing[:, 0], "odom_p": nothing[:, :3]}
     readings = Run({**columns, "odom_q_xyzw": nothing})
     entry = Entry(method=method, options=dict(options))
-    contestant = Contestant(entry, Problem(belief=None, extent=(0, 1, 0, 1)), 0, readings, START_S, ())
+    contestant = Contestant(
+        entry, Problem(belief=None, extent=(0, 1, 0, 1)), 0, readings, START_S, ("numba",)
+    )
     try:
         contestant.load()
     except LocalizerError as error:
