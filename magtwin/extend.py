@@ -103,12 +103,6 @@ class Registry(Mapping[str, T]):
                     ) from error
         return self._loaded[name]
 
-    def origin(self, name: str) -> str:
-        """Whose an entry is: "built-in", "registered" in this process, or "installed"."""
-        if name in self._builtin:
-            return "built-in"
-        return "installed" if name in self._entry_points() else "registered"
-
     def __iter__(self) -> Iterator[str]:
         """All names: built-in ones first, then registered and installed ones."""
         return iter(dict.fromkeys([*self._builtin, *self._loaded, *self._entry_points()]))

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Self
 
@@ -24,7 +25,7 @@ from magtwin.bench.suite import Entry
 from magtwin.errors import InputError
 from magtwin.files.children import environment
 from magtwin.files.file import shipped
-from magtwin.localization.localizers import LOCALIZERS, load_localizer
+from magtwin.localization.localizers import LOCALIZERS, SHIPPED, load_localizer
 from magtwin.localization.problem import Estimate, Problem
 from magtwin.localization.readings import onboard, packed
 from magtwin.localization.track import LocalizerError
@@ -43,7 +44,7 @@ START_S = 300.0
 
 def foreign(method: str) -> bool:
     """Whether the code of a localizer is not part of magtwin."""
-    return ":" in method or LOCALIZERS.origin(method) != "built-in"
+    return method not in SHIPPED
 
 
 def seals(method: str) -> bool:
@@ -51,8 +52,9 @@ def seals(method: str) -> bool:
 
     One that the program itself registered is not known in another process.
     """
-    where = "installed" if ":" in method else LOCALIZERS.origin(method)
-    return where == "installed" and jail.version() > 0
+    if not foreign(method) or not jail.version():
+        return False
+    return ":" in method or method in entry_points(group=LOCALIZERS.group).names
 
 
 def seed_of(suite: str, scenario: str, run: int, localizer: str, salt: bytes = b"") -> int:
