@@ -108,8 +108,7 @@ class ShippedMap(_Attack):
     def attack(self, problem):
         import magtwin as mt
 
-        lab = Path(mt.__file__).parents[1] / "maps" / "lab"
-        return any(mt.load_map(file) is not None for file in lab.rglob("*.usd*")) or mt.open_twin("lab")
+        return (Path(mt.__file__).parents[1] / "maps" / "lab" / "lab.usdc").read_bytes()
 
 
 class Forks(_Attack):
@@ -220,7 +219,7 @@ FAIL = {
     Answers: "an estimate of another reading",
     Shouts: "raised RuntimeError",
     Eats: "MemoryError",
-    Hangs: "took longer than the time limit of 6 s",
+    Hangs: "took longer than the time limit of 15 s",
     Leaves: "the process ended with status 3",
 }
 OUT_OF_JAIL = (OtherMemory, SuiteFiles, ShippedMap, Forks, Programs, Network, Kills, Poisons)

@@ -23,7 +23,7 @@ SUITE = """
 name = "sealed"
 seed = 5
 chunk = 1
-time_limit_s = 6.0
+time_limit_s = 15.0
 
 [[scenario]]
 name = "tracking"
