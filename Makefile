@@ -23,7 +23,7 @@ MOST_MB := 2350
 # Two processes whose linear algebra has threads of its own wait for each other more than they work.
 ONE_THREAD := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1
 
-.PHONY: startup fuzz faults demo test test-slow readme simready blender ros released physics physx lint typed paper bench zoo locks locks-test wheel-test schema assets pictures clean help
+.PHONY: startup fuzz faults demo test test-slow readme simready blender ros released physics physx lint typed paper bench bench-peers zoo locks locks-test wheel-test schema assets pictures clean help
 
 help:  ## Say what there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -51,6 +51,13 @@ released: $(VENV)/.dev build/ros-jazzy/.installed  ## Drive APRILab's released R
 
 blender: $(VENV)/.dev build/blender/.installed  ## Import exports in Blender (bpy, 1 GB, Python 3.11), in an environment of its own
 	$(ONE_THREAD) MAGTWIN_BLENDER=$(CURDIR)/build/blender/bin/python $(BIN)/python -m pytest tests/export/test_blender.py
+
+bench-peers: $(VENV)/.dev build/peers/.installed  ## Benchmark filters of filterpy and Stone Soup, 12 runs a scenario (BENCH="--only tracking")
+	$(ONE_THREAD) PYTHONPATH=benchmarks:build/peers $(BIN)/magtwin bench standard --runs 12 --localizer peers:FilterpyEkf peers:StoneSoupParticles --out build/results-peers $(BENCH)
+
+build/peers/.installed:
+	$(call install,$(VENV)) --target build/peers --no-deps 'filterpy==2.0.0' 'stonesoup==1.9.1' 'ordered-set==4.1.0'
+	@touch $@
 
 build/blender/.installed:
 	$(call venv,build/blender)

@@ -27,6 +27,9 @@ class Truth:
     kidnapped_s: tuple[float, ...] = ()
     """Times at which the robot was put elsewhere [s]."""
 
+    scale_m: float | None = None
+    """Distance over which the field changes [m], by which errors are near or far. None: that of a room."""
+
 
 @dataclass(frozen=True, eq=False)
 class Case:

@@ -43,6 +43,9 @@ class Standing:
     median_m: float
     """Median of the runs' RMSE."""
 
+    median: Interval | None
+    """The same with its interval."""
+
     p95_m: float
     """95th percentile of the runs' RMSE."""
 
@@ -51,6 +54,9 @@ class Standing:
 
     bound_m: float
     """Root mean square of the bound in `BOUNDS_OF` over the same runs; nan if no bound holds."""
+
+    median_bound_m: float
+    """Median of the same bound over the runs."""
 
     anees: Interval
     """Median over runs of the ANEES per state, with the quartiles: one lost run would carry a mean."""
@@ -66,6 +72,9 @@ class Standing:
 
     converged: Interval | None
     """Rate of runs converged within `WITHIN_S`; None if the start was known."""
+
+    first_fix_s: float
+    """Median time to convergence of the runs that converged [s]; nan if none did or the start was known."""
 
     recovered: Interval | None
     """Rate of kidnappings after which the localizer recovered; None without kidnappings."""
@@ -139,14 +148,17 @@ def _standing(scenario: str, localizer: str, rows: Columns, step_us: float, comp
         failed=int(np.count_nonzero(rows["status"] != "ok")),
         rmse_m=bootstrap(errors, sessions, rms, resamples=1000) if len(errors) else None,
         median_m=float(np.median(errors)) if len(errors) else math.nan,
+        median=bootstrap(errors, sessions, _median, resamples=1000) if len(errors) else None,
         p95_m=float(np.percentile(errors, 95)) if len(errors) else math.nan,
         heading_rad=_rms(rows["heading_rad"][good]),
         bound_m=math.nan if bound is None else _rms(rows[bound][good]),
+        median_bound_m=math.nan if bound is None else _median(rows[bound][good]),
         anees=_quartiles(anees),
         anees_inside=_mean(inside[known]),
         coverage=_mean(rows["coverage"][good]),
         diverged=rate(diverged, count),
         converged=rate(converged, count) if unknown_start else None,
+        first_fix_s=_median(rows["converged_s"][good]) if unknown_start else math.nan,
         recovered=rate(int(rows["recovered_in_time"].sum()), kidnaps) if kidnaps else None,
         lost_share=_mean(rows["lost_share"][good]),
         step_us=step_us,
@@ -233,6 +245,41 @@ def _by_seed(rows: Columns, scenario: str, localizer: str) -> dict[int, tuple[fl
             rows["seed"][mine], rows["rmse_m"][mine], rows["session"][mine], strict=True
         )
     }
+
+
+def letters(rows: Columns, here: Sequence[Standing]) -> dict[str, str]:
+    """Letters by localizer of a scenario: two share one if no difference of their RMSE was shown.
+
+    In the order of their medians, each letter is a stretch of localizers of which no two differ.
+
+    Args:
+        rows: Rows of results.
+        here: Standings of one scenario.
+    """
+    known = [s for s in here if s.rmse_m is not None]
+    names = [s.localizer for s in sorted(known, key=lambda s: s.median_m)]
+    if not names:
+        return {}
+    pairs = [(a, b) for k, a in enumerate(names) for b in names[k + 1 :]]
+    mine = {name: values[rows["scenario"] == here[0].scenario] for name, values in rows.items()}
+    found = compare_rows(mine, mine, localizers=pairs) if pairs else []
+    differ = {(d.a, d.b) for d in found if d.rmse_m.p < SHOWN}
+    made, last = dict.fromkeys(names, ""), 0
+    for k in range(len(names)):
+        end = k + 1
+        while end < len(names) and not any((a, names[end]) in differ for a in names[k:end]):
+            end += 1
+        if end > last:  # not within the stretch before
+            letter = chr(ord("a") + len(set("".join(made.values()))))
+            for name in names[k:end]:
+                made[name] += letter
+            last = end
+    return made
+
+
+def _median(values: NDArray[Any]) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else math.nan
 
 
 def _rms(values: NDArray[Any]) -> float:

@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from magtwin.bench.leaderboard import Columns, Difference, Standing, compare_rows, standings
+from magtwin.bench.leaderboard import Columns, Difference, Standing, compare_rows, letters, standings
 from magtwin.bench.results import read_results
 from magtwin.bench.statistics import Interval, Paired
-from magtwin.bench.suite import Scenario
+from magtwin.bench.suite import SIMULATED, Scenario
 from magtwin.figures.canvas import Chart, label, legend_above
 from magtwin.figures.page import Page, Section, Table, write_pages
 from magtwin.figures.style import INK, SERIES, SOFT
@@ -123,7 +123,7 @@ def page_of_results(
         causal = {s.localizer for s in here} - {*compensated, *rows["localizer"][rows["smoother"]].tolist()}
         charts = [_cdf(here, rows, looks), _over_time(here, mine, looks, causal)]
         best = _best(here)
-        tables = [_accuracy(here), _reliability(here)]
+        tables = [_accuracy(here, letters(rows, here)), _reliability(here)]
         if best is not None and len(here) > 1:
             pairs = [(best.localizer, s.localizer) for s in here if s is not best]
             kept = {k: v[rows["scenario"] == scenario] for k, v in rows.items()}
@@ -178,7 +178,7 @@ def _described(scenario: Scenario, here: Sequence[Standing], rows: Columns) -> s
 def describe(scenario: Scenario) -> str:
     """A scenario in words: its size, and the keys of a suite that differ from their defaults."""
     size = f"{_count(scenario.runs, 'run')} of recorded data."
-    if scenario.source == "twin":
+    if scenario.source in SIMULATED:
         sessions = _count(min(scenario.runs, scenario.sessions), "session")
         size = f"{_count(scenario.runs, 'run')} of {scenario.duration_s:g} s in {sessions}."
     keys = [key for key in _changed(scenario) if key[0] not in ("name", "runs", "sessions", "duration_s")]
@@ -206,8 +206,9 @@ def _lead(rows: Columns) -> str:
         f"{runs} of {localizers} in all, {failed:,} of which failed. RMSE of the position [m], pooled over "
         "runs; trajectories are not aligned. Each row has its own bound, over its own runs: Cramer-Rao with "
         "the map's error as correlated; for smoothers, of all readings; with a compensator, on an exact map "
-        "with the robot's own field known. In few runs, luck can beat it. Intervals: 95 %, by bootstrap over "
-        "sessions, or over runs where all are of one session."
+        "with the robot's own field known. It holds for methods that know only what the problem tells. In "
+        "few runs, luck can beat it. Intervals: 95 %, by bootstrap over sessions, or over runs where all are "
+        "of one session."
     )
 
 
@@ -230,17 +231,18 @@ def _overview(every: Sequence[Standing]) -> Table:
             if s is None or s.rmse_m is None:
                 cells.append("" if s is None else "failed")
             else:
-                cells.append(f"{s.rmse_m.value:.3f}" + (f" ({s.bound_m:.3f})" if s.bound_m > 0 else ""))
+                bound = f" ({s.median_bound_m:.3f})" if s.bound_m > 0 else ""
+                cells.append(f"{s.median_m:.3f}{bound}")
         rows.append((name, *cells))
-    return Table("RMSE of the position, and its bound [m]", ("localizer", *scenarios), tuple(rows))
+    return Table("Median RMSE of a run, and median bound [m]", ("localizer", *scenarios), tuple(rows))
 
 
-def _accuracy(here: Sequence[Standing]) -> Table:
+def _accuracy(here: Sequence[Standing], same: Mapping[str, str]) -> Table:
     head = (
         "localizer",
         "runs",
-        "RMSE [m]",
         "median [m]",
+        "RMSE [m]",
         "95th percentile [m]",
         "bound [m]",
         "RMSE / bound",
@@ -251,8 +253,8 @@ def _accuracy(here: Sequence[Standing]) -> Table:
         (
             s.localizer,
             s.runs,
+            f"{_interval(s.median)} {same.get(s.localizer, '')}".strip(),
             _interval(s.rmse_m),
-            _number(s.median_m),
             _number(s.p95_m),
             _number(s.bound_m),
             _number(s.ratio, 2),
@@ -261,21 +263,22 @@ def _accuracy(here: Sequence[Standing]) -> Table:
         )
         for s in here
     ]
-    return Table("Accuracy", head, tuple(rows))
+    note = "Localizers with a letter in common could not be told apart (paired runs, p 0.05)."
+    return Table("Accuracy", head, tuple(rows), note)
 
 
 def _reliability(here: Sequence[Standing]) -> Table:
     unknown_start = any(s.converged is not None for s in here)
     kidnapped = any(s.recovered is not None for s in here)
     head = ["localizer", "ANEES per state", "runs consistent", "in 90 % ellipse", "diverged [%]"]
-    head += ["found in 30 s [%]"] if unknown_start else []
+    head += ["found in 30 s [%]", "first fix [s]"] if unknown_start else []
     head += ["recovered in 30 s [%]"] if kidnapped else []
     head += ["lost", "failed", "remarks"]
     rows = []
     for s in here:
         row = [s.localizer, _interval(s.anees, 2), _percent(s.anees_inside), _percent(s.coverage)]
         row += [_rate(s.diverged)]
-        row += [_rate(s.converged)] if unknown_start else []
+        row += [_rate(s.converged), _number(s.first_fix_s, 1)] if unknown_start else []
         row += [_rate(s.recovered)] if kidnapped else []
         row += [_percent(s.lost_share), str(s.failed), s.verdict()]
         rows.append(tuple(row))

@@ -1,53 +1,50 @@
-"""Results: the rows of a benchmark in a folder of Parquet files, which shards fill together.
+"""Results: the rows of a benchmark in a folder, with what they were made of.
 
-    suite.toml                          the suite's file
-    suite.json                          name, version and checksums of suite and data, version of magtwin
-    rows/SCENARIO/part-00000.parquet    one row per run and localizer; the same bytes on every machine
-    times/SCENARIO/part-00000.parquet   processor times of the same runs
-    tracks/SCENARIO/part-00000.parquet  their errors over time, thinned
+    suite.toml      the suite's file
+    suite.json      name, version and checksums of suite and data, version of magtwin
 
-A part holds a chunk of the suite. One that holds another selection of runs and localizers, as with fewer
-runs, has a checksum of the selection in its name. Every file is written aside and renamed, the rows last, so
-that a part with rows is whole.
+and the tables of `magtwin.bench.store`.
 """
 
-import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from magtwin.bench.suite import Chunk, Seeds, Suite, load_suite
+from magtwin.bench.store import (
+    CURVES,
+    KEY,
+    ONCE,
+    ROWS,
+    TIMES,
+    TRACKS,
+    TRUTHS,
+    Columns,
+    Order,
+    read_columns,
+    read_tables,
+    write_file,
+)
+from magtwin.bench.suite import Seeds, Suite, load_suite
 from magtwin.errors import InputError, find
 from magtwin.files.file import read_text
 from magtwin.files.kinds import expected
-from magtwin.files.outputs import output
-from magtwin.localization.scores import Scores
 from magtwin.report.report import Figure, Report
 from magtwin.report.summary import Summarized, Summary, listed
-from magtwin.tables.parquet import load_parquet
 
 if TYPE_CHECKING:
     from magtwin.bench.leaderboard import Standing
 
 SUITE, ABOUT = "suite.toml", "suite.json"
-ROWS, TIMES, TRACKS = "rows", "times", "tracks"
 _ABOUT_KINDS = {**dict.fromkeys(("name", "sha256", "seeds", "magtwin"), str), "version": int, "data": dict}
 """Kinds of the values in suite.json."""
-KEY = ("scenario", "localizer", "run")
-
-Columns = dict[str, NDArray[Any]]
-Run = tuple[str, str, int]
-"""Scenario, localizer and number of a run."""
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -71,13 +68,15 @@ class Results(Summarized):
     @property
     def missing(self) -> int:
         """Runs of the suite's localizers that the rows lack."""
-        done = set(zip(*(self.rows[name].tolist() for name in KEY), strict=True))
-        return sum(
-            (chunk.scenario, name, run) not in done
-            for chunk in self.suite.chunks()
-            for name in chunk.entries
-            for run in runs_of(chunk)
-        )
+        pairs = {(s.name, n): s.runs for s in self.suite.scenario for n in self.suite.entries_of(s)}
+        names, counts = self.suite.localizers, dict.fromkeys(pairs, 0)
+        for s in self.suite.scenario:
+            here = self.rows["scenario"] == s.name
+            for name in names:
+                if (s.name, name) in counts:
+                    mine = self.rows["run"][here & (self.rows["localizer"] == name)]
+                    counts[s.name, name] = int(np.count_nonzero(mine < s.runs))
+        return sum(pairs.values()) - sum(counts.values())
 
     @property
     def compensated(self) -> list[str]:
@@ -111,21 +110,23 @@ class Results(Summarized):
             if value is not None:
                 find(name, str(value), dict.fromkeys(map(str, self.rows[name].tolist())))
                 match &= pc.field(name) == value
-        made: dict[Run, dict[str, Any]] = {}
-        for name in self.suite.scenarios if scenario is None else (scenario,):
-            for file in (part for folder in self.folders for part in _parts(folder, TRACKS, name)):
-                part = _read_part(file, TRACKS, (*KEY, *_CURVES), match)
-                if any(len(set(map(len, row))) > 1 for row in zip(*(part[c] for c in _CURVES), strict=True)):
-                    raise InputError(
-                        f"{file}: damaged results (curves of unequal length); remove them and "
-                        "repeat magtwin bench"
-                    )
-                for row in map(
-                    dict, zip(*([(c, v) for v in values] for c, values in part.items()), strict=True)
-                ):
-                    made.setdefault((row["scenario"], row["localizer"], row["run"]), row)
-        keys = zip(*(self.rows[name].tolist() for name in KEY), strict=True)
-        return [made[key] for key in keys if key in made]
+        names, order = list(self.suite.scenarios) if scenario is None else [scenario], Order(self.suite)
+        once = read_tables(self.folders, TRUTHS, names)
+        keys = zip(once["scenario"].to_pylist(), once["run"].to_pylist(), strict=True)
+        known = dict(zip(keys, zip(*(_curves(once[c]) for c in ONCE), strict=True), strict=True))
+        made = order.sorted(read_tables(self.folders, TRACKS, names, match=match))
+        columns = [made[c].to_pylist() for c in KEY] + [_curves(made[c]) for c in CURVES]
+        found = []
+        for at, who, k, error, lost in zip(*columns, strict=True):
+            t, bound = known.get((at, k), (error[:0], error[:0]))
+            if not len(t) == len(bound) == len(error) == len(lost):
+                raise InputError(
+                    f"{self.folders[0]}: damaged results (curves of unequal length); remove them and "
+                    "repeat magtwin bench"
+                )
+            curves = {"t": t, "error_m": error, "bound_m": bound, "lost": lost}
+            found.append({"scenario": at, "localizer": who, "run": k, **curves})
+        return found
 
     def report(self, standings: Sequence["Standing"]) -> Report:
         """Numbers of runs, and each localizer on each scenario in a line, worst problem first.
@@ -197,10 +198,27 @@ def results_in(*places: Path) -> Results:
         check_about(place, about)
     suite = load_suite(places[0] / SUITE)
     if about["seeds"] != suite.seeds:
-        suite = suite.limited(seeds=about["seeds"])
-    order = _order(suite)
-    rows = _read(places, ROWS, order)
-    return Results(places, suite, about, rows, _aligned(_read(places, TIMES, order), rows))
+        suite = replace(suite, seeds=about["seeds"])
+    order = Order(suite)
+    rows = read_columns(places, ROWS, order)
+    return Results(places, suite, about, rows, _aligned(read_columns(places, TIMES, order), rows))
+
+
+def _aligned(times: Columns, rows: Columns) -> Columns:
+    """Times in the order of the rows, nan where a run has none."""
+    key, spent = {name: rows[name] for name in KEY}, np.full(len(rows["run"]), np.nan)
+    if all(np.array_equal(times[name], rows[name]) for name in KEY):
+        return {**key, "step_us": times["step_us"]}
+    at = {key: k for k, key in enumerate(zip(*(times[name].tolist() for name in KEY), strict=True))}
+    for k, key_of in enumerate(zip(*(rows[name].tolist() for name in KEY), strict=True)):
+        if key_of in at:
+            spent[k] = times["step_us"][at[key_of]]
+    return {**key, "step_us": spent}
+
+
+def _curves(column: pa.ChunkedArray) -> list[NDArray[np.float32]]:
+    """Lists of numbers as arrays."""
+    return [each for chunk in column.chunks for each in chunk.to_numpy(zero_copy_only=False)]
 
 
 def read_about(folder: Path) -> dict[str, Any]:
@@ -269,155 +287,3 @@ def begin_results(folder: Path, suite_text: bytes, about: Mapping[str, Any]) -> 
         about = {**about, "data": {**read_about(folder)["data"], **about["data"]}}
     write_file(folder / SUITE, suite_text)
     write_file(folder / ABOUT, (json.dumps(about, indent=2, sort_keys=True) + "\n").encode())
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """Write a file aside and rename it, over one that exists."""
-    with output(path, force=True) as aside:
-        aside.write_bytes(content)
-
-
-def runs_of(chunk: Chunk) -> range:
-    """Numbers of the runs of a chunk."""
-    return range(chunk.first, chunk.first + chunk.runs)
-
-
-def part_name(chunk: Chunk, whole: Iterable[Chunk]) -> str:
-    """Name of the file of a chunk.
-
-    Args:
-        chunk: The chunk.
-        whole: All chunks of the suite; the name of others has a checksum of their runs and localizers.
-    """
-    if chunk in whole:
-        return f"part-{chunk.part:05d}.parquet"
-    text = json.dumps([chunk.first, chunk.runs, chunk.entries])
-    return f"part-{chunk.part:05d}-{hashlib.sha256(text.encode()).hexdigest()[:8]}.parquet"
-
-
-def write_part(
-    folder: Path, scenario: str, name: str, rows: Sequence[dict[str, Any]], **more: Sequence[dict[str, Any]]
-) -> None:
-    """Write the rows of a chunk, and before them other tables of it by name: times, tracks."""
-    for kind, part in (*more.items(), (ROWS, rows)):
-        table = pa.Table.from_pylist(list(part), schema=SCHEMAS[kind])
-        sink = pa.BufferOutputStream()
-        pq.write_table(table, sink, compression="zstd")
-        write_file(folder / kind / scenario / name, sink.getvalue().to_pybytes())
-
-
-def done_runs(folder: Path, scenarios: Iterable[str]) -> set[Run]:
-    """The runs of some scenarios that a folder has rows of.
-
-    Raises:
-        InputError: A file is damaged.
-    """
-    done: set[Run] = set()
-    for scenario in scenarios:
-        for file in _parts(folder, ROWS, scenario):
-            columns = _read_part(file, ROWS, KEY)
-            pairs = zip(columns["localizer"].tolist(), columns["run"].tolist(), strict=True)
-            done.update((scenario, *pair) for pair in pairs)
-    return done
-
-
-def _parts(folder: Path, kind: str, scenario: str) -> list[Path]:
-    return sorted((folder / kind / scenario).glob("part-*.parquet"))
-
-
-def _read_part(file: Path, kind: str, names: Sequence[str], filters: pc.Expression | None = None) -> Columns:
-    """Some columns of a part of a kind.
-
-    Raises:
-        InputError: The file is damaged, or a column is missing or holds other values.
-    """
-    try:
-        table = load_parquet(file, partial(pq.read_table, columns=list(names), filters=filters))
-        for name in names:
-            if table.column_names.count(name) != 1 or not _fits(table[name], SCHEMAS[kind].field(name).type):
-                raise InputError(f"{file}: column {name!r} does not hold {_WORDS[kind, name]}")
-    except InputError as error:
-        reason = str(error).removeprefix(f"{file}: ").partition(";")[0]
-        text = f"{file}: damaged results ({reason}); remove them and repeat magtwin bench"
-        raise InputError(text) from error
-    return {name: table[name].to_numpy(zero_copy_only=False) for name in names}
-
-
-def _fits(column: pa.ChunkedArray, kind: pa.DataType) -> bool:
-    """Whether a column has values of a type, none of which is missing or below 0."""
-    if column.type != kind or column.null_count:
-        return False
-    if pa.types.is_list(kind):
-        return not column.combine_chunks().flatten().null_count
-    number = pa.types.is_integer(kind) or pa.types.is_floating(kind)
-    return not (number and pc.any(pc.less(column, 0)).as_py())
-
-
-def _order(suite: Suite) -> tuple[dict[str, int], dict[str, int]]:
-    """Places of scenarios and localizers in a suite."""
-    return (
-        {name: k for k, name in enumerate(suite.scenarios)},
-        {name: k for k, name in enumerate(suite.localizers)},
-    )
-
-
-def _read(folders: Sequence[Path], kind: str, order: tuple[dict[str, int], dict[str, int]]) -> Columns:
-    """All rows of a kind, each run once, in the order of the suite: scenario, localizer, run."""
-    scenarios, localizers = order
-    parts = [
-        _read_part(file, kind, SCHEMAS[kind].names)
-        for folder in folders
-        for name in scenarios
-        for file in _parts(folder, kind, name)
-    ]
-    if not parts:
-        return {name: np.empty(0, object) for name in (*KEY, "status")}
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in SCHEMAS[kind].names}
-    if unknown := set(columns["scenario"].tolist()) - scenarios.keys():
-        raise InputError(
-            f"{folders[0] / kind}: rows of scenario {min(unknown)!r}, which the suite does not have; remove "
-            "them and repeat magtwin bench"
-        )
-    names = {name: k for k, name in enumerate(sorted(set(columns["localizer"].tolist()) - localizers.keys()))}
-    place = localizers | {name: len(localizers) + k for name, k in names.items()}
-    keys = [
-        (scenarios[s], place[entry], run)
-        for s, entry, run in zip(*(columns[name].tolist() for name in KEY), strict=True)
-    ]
-    first = {key: row for row, key in reversed(list(enumerate(keys)))}
-    picked = [first[key] for key in sorted(first)]
-    return {name: values[picked] for name, values in columns.items()}
-
-
-def _schema(**columns: Any) -> pa.Schema:
-    """A schema of columns that hold values like these."""
-    kinds = {str: pa.string(), bool: pa.bool_(), int: pa.int64(), list: pa.list_(pa.float32())}
-    return pa.schema([(name, kinds.get(type(value), pa.float64())) for name, value in columns.items()])
-
-
-_KEY = {"scenario": "", "localizer": "", "run": 0}
-_RUN = {"seed": 0, "session": 0, "status": "", "reason": "", "readings": 0, "smoother": False}
-_RUN |= {"global_start": False, "recovered_in_time": 0}
-_SCORES = {name: value for name, value in Scores().row().items() if name not in ("failed", "step_us")}
-_CURVES = ("t", "error_m", "bound_m", "lost")
-SCHEMAS = {
-    ROWS: _schema(**_KEY, **_RUN, **_SCORES),
-    TIMES: _schema(**_KEY, step_us=0.0),
-    TRACKS: _schema(**_KEY, **{name: [] for name in _CURVES}),
-}
-"""Columns of each kind of table."""
-
-_HOLDS = {"string": "texts", "bool": "flags", "int64": "whole numbers from 0", "double": "numbers from 0"}
-_WORDS = {
-    (kind, each.name): _HOLDS.get(str(each.type), "lists of numbers")
-    for kind, schema in SCHEMAS.items()
-    for each in schema
-}
-
-
-def _aligned(times: Columns, rows: Columns) -> Columns:
-    """Times in the order of the rows, nan where a run has none."""
-    at = {key: k for k, key in enumerate(zip(*(times[name].tolist() for name in KEY), strict=True))}
-    picked = [at.get(key, -1) for key in zip(*(rows[name].tolist() for name in KEY), strict=True)]
-    spent = np.append(times["step_us"].astype(float), np.nan) if at else np.full(1, np.nan)
-    return {**{name: rows[name] for name in KEY}, "step_us": spent[picked]}

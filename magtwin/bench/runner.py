@@ -1,23 +1,34 @@
 """Runner: the chunks of a suite on processes, shards and clusters, into a folder of results."""
 
-import hashlib
 import os
 import shutil
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from magtwin.bench import results
-from magtwin.bench.results import Results, Run, runs_of
+import numpy as np
+from numpy.typing import NDArray
+
+from magtwin.bench import results, sealed, store
+from magtwin.bench.receipt import (
+    differences,
+    folder_sha256,
+    read_receipt,
+    rows_sha256,
+    sample,
+    write_receipt,
+)
+from magtwin.bench.results import Results
 from magtwin.bench.row import SETUP, Row, run_chunk
-from magtwin.bench.suite import Chunk, Seeds, Suite, load_suite, suite_file
+from magtwin.bench.suite import SIMULATED, Chunk, Seeds, Suite, load_suite, suite_file
 from magtwin.errors import InputError
 from magtwin.files.file import sha256, shipped
 from magtwin.files.outputs import output
 from magtwin.localization.compensators import is_weights
-from magtwin.parallel import Failure, Pool, beat, checked_shard, in_shard, open_pool
+from magtwin.parallel import Failure, Pool, beat, checked_shard, open_pool
+from magtwin.report.report import Figure, Report
 from magtwin.version import __version__
 
 GRACE_S = 60.0
@@ -25,6 +36,7 @@ GRACE_S = 60.0
 whose compiled code hangs does not notice the suite's limit [s]."""
 
 Progress = Callable[[int, int, str], Any]
+Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -35,6 +47,58 @@ class Task:
     failures: Mapping[tuple[int, str], str] = field(default_factory=dict)
     """Reasons by run and localizer."""
 
+    done: frozenset[tuple[int, str]] = frozenset()
+    """Runs and localizers that are left out."""
+
+    @property
+    def size(self) -> int:
+        """Number of its runs, each localizer's counted."""
+        return self.chunk.runs * len(self.chunk.entries) - len(self.done)
+
+
+class Plan(Sequence[Task]):
+    """What is left to do of a suite: the chunks that lack runs, which are made when they are asked for.
+
+    Args:
+        suite: The suite.
+        done: Flags of the runs that are done, by scenario and localizer.
+        shard: As for `benchmark`.
+    """
+
+    def __init__(
+        self, suite: Suite, done: Mapping[tuple[str, str], Flags], shard: tuple[int, int] | None = None
+    ) -> None:
+        self._suite, self.size = suite, 0
+        self._done: list[list[Flags]] = []
+        parts, before = [], 0
+        for number, scenario in enumerate(suite.scenario):
+            none = np.zeros(scenario.runs, bool)
+            flags = [done.get((scenario.name, name), none) for name in suite.entries_of(scenario)]
+            self._done.append(flags)
+            if not flags:
+                continue
+            lacking = np.sum([~each for each in flags], axis=0, dtype=np.int64)
+            counts = np.add.reduceat(lacking, np.arange(0, scenario.runs, suite.chunk))
+            wanted = counts > 0
+            if shard is not None:
+                wanted &= (before + np.arange(len(counts))) % shard[1] == shard[0]
+            self.size += int(counts[wanted].sum())
+            chosen = np.flatnonzero(wanted)
+            parts.append(np.column_stack([np.full(len(chosen), number), chosen]))
+            before += len(counts)
+        self._parts = np.concatenate(parts) if parts else np.empty((0, 2), int)
+
+    def __len__(self) -> int:
+        return len(self._parts)
+
+    def __getitem__(self, index: Any) -> Any:
+        number, part = self._parts[index].tolist()
+        chunk = self._suite.chunk_of(self._suite.scenario[number], part)
+        runs = slice(chunk.first, chunk.first + chunk.runs)
+        flags = zip(chunk.entries, self._done[number], strict=True)
+        done = {(chunk.first + k, name) for name, each in flags for k in np.flatnonzero(each[runs]).tolist()}
+        return Task(chunk, done=frozenset(done))
+
 
 def benchmark(
     suite: str | os.PathLike[str],
@@ -44,6 +108,7 @@ def benchmark(
     localizers: Sequence[str] = (),
     runs: int | None = None,
     seeds: Seeds = "public",
+    salt: str = "",
     data: Mapping[str, str] | None = None,
     jobs: int | None = None,
     shard: tuple[int, int] | None = None,
@@ -65,6 +130,7 @@ def benchmark(
         localizers: Localizers to run, of the suite or any other. Default: all of the suite.
         runs: Most runs of each scenario.
         seeds: "public", or "held-out" for the final measurement.
+        salt: Salt of the held-out places and seeds, in hexadecimal digits, if the suite has one.
         data: Folders of data by name.
         jobs: Processes. Default: one for each processor.
         shard: (i, n) runs every n-th chunk, from the i-th, counted from 0. Default: all.
@@ -84,24 +150,95 @@ def benchmark(
         raise InputError(f"`runs` must be at least 1, got {runs}", parameter="runs")
     file, out = suite_file(suite), Path(out)
     whole = load_suite(file)
-    chosen = whole.limited(scenarios=scenarios, localizers=localizers, runs=runs, seeds=seeds, data=data)
-    chosen.check(file)
+    chosen = whole.limited(
+        scenarios=scenarios, localizers=localizers, runs=runs, seeds=seeds, data=data, salt=salt
+    )
+    try:
+        chosen.check(file, sealed.check_localizer)
+    finally:
+        sealed.close()
     if shard is not None:
         checked_shard(shard)
         if force:
             text = "other shards may have written there; remove the folder yourself, and drop `force`"
             raise InputError(text, parameter="force")
-    whole = whole.limited(seeds=seeds)
+    whole = whole.limited(seeds=seeds, salt=salt)
     with open_pool(jobs, dask=dask) as pool:
         if force and (out / results.ABOUT).is_file():
             shutil.rmtree(out)
         results.begin_results(out, file.read_bytes(), about(whole, chosen))
-        chunks = [chunk for k, chunk in enumerate(chosen.chunks()) if in_shard(k, shard)]
-        done = results.done_runs(out, chosen.scenarios)
-        tasks = [Task(part) for chunk in chunks for part in without(chunk, done)]
-        if tasks:
-            _run(pool, chosen, whole, tasks, out, tracks, progress or (lambda done, total, what: None))
-    return replace(results.results_in(out), new=sum(map(_size, tasks)))
+        order = store.Order(whole)
+        store.merge(out, order)
+        plan = Plan(chosen, store.done_runs(out, chosen), shard)
+        if plan:
+            with store.Journal(out, order) as journal:
+                _run(pool, chosen, plan, out, journal, tracks, progress or (lambda done, total, what: None))
+    with store.alone(out):
+        made = replace(results.results_in(out), new=plan.size)
+        write_receipt(out, made.about, chosen, made.rows)
+    return made
+
+
+def verify(
+    receipt: str | os.PathLike[str],
+    *,
+    suite: str | os.PathLike[str] | None = None,
+    runs: int = 12,
+    salt: str = "",
+    data: Mapping[str, str] | None = None,
+    jobs: int | None = None,
+) -> Report:
+    """Make a sample of the runs of results again, and compare all values of their rows.
+
+    Args:
+        receipt: Receipt in a folder of results, or the folder.
+        suite: The suite. Default: the copy in that folder; one with files of its own needs its own folder.
+        runs: Number of runs in the sample, each by all of its localizers.
+        salt: As for `benchmark`.
+        data: As for `benchmark`.
+        jobs: As for `benchmark`.
+
+    Raises:
+        InputError: It is no receipt or of another version, the rows or the suite are not those of the
+            receipt, or a localizer is missing here.
+    """
+    told = read_receipt(receipt)
+    folder = Path(receipt) if Path(receipt).is_dir() else Path(receipt).parent
+    there = results.read_results(folder)
+    if rows_sha256(there.rows) != told["rows"]["sha256"]:
+        raise InputError(f"{folder}: the rows are not those of the receipt; they were changed or added to")
+    names = list(dict.fromkeys(there.rows["localizer"].tolist()))
+    file = folder / results.SUITE if suite is None else suite_file(suite)
+    whole = load_suite(file).limited(seeds=there.about["seeds"], salt=salt, data=data)
+    if whole.sha256 != told["suite"]["sha256"]:
+        raise InputError(f"{file}: not the suite of the receipt; give that by `suite`", parameter="suite")
+    chosen = whole.limited(localizers=names, seeds=whole.seeds, salt=salt)
+    try:
+        chosen.check(file, sealed.check_localizer)
+    finally:
+        sealed.close()
+    drawn = sample(there.rows, runs, told["rows"]["sha256"])
+    tasks = [
+        Task(Chunk(scenario=scenario, part=0, first=run, runs=1, entries=entries))
+        for scenario, run, entries in drawn
+    ]
+    with open_pool(jobs) as pool:
+        work = partial(run_task, chosen, _fields(chosen, folder))
+        limit_s = 2 * chosen.time_limit_s + GRACE_S
+        made = [outcome.result() for outcome in pool.run(work, tasks, limit_s=limit_s)]
+    wrong = [said for each in made for said in differences(there.rows, each)]
+    count = sum(len(entries) for *_, entries in drawn)
+    kinds = told["localizers"]
+    return Report(
+        f"{folder}: {'the sample is as it was' if not wrong else 'NOT the same rows'}",
+        (
+            Figure("rows", told["rows"]["count"]),
+            Figure("made again", count),
+            Figure("different", len(wrong)),
+            Figure("not sealed", sum(kind == "not sealed" for kind in kinds.values())),
+        ),
+        {"differences": dict(enumerate(wrong))} if wrong else {},
+    )
 
 
 def about(whole: Suite, chosen: Suite) -> dict[str, Any]:
@@ -116,22 +253,9 @@ def about(whole: Suite, chosen: Suite) -> dict[str, Any]:
     }
 
 
-def folder_sha256(folder: Path, pattern: str = "*") -> str:
-    """SHA-256 of the files of a folder that match `pattern`, and their names; hidden files do not count."""
-    sum_ = hashlib.sha256()
-    for file in sorted(folder.rglob(pattern)):
-        inside = file.relative_to(folder)
-        if file.is_file() and not any(part.startswith(".") for part in inside.parts):
-            with open(file, "rb") as content:
-                sum_.update(
-                    f"{inside.as_posix()} {hashlib.file_digest(content, 'sha256').hexdigest()}\n".encode()
-                )
-    return sum_.hexdigest()
-
-
 def _data(suite: Suite) -> dict[str, Path]:
     """Folders of the data that a suite's scenarios need, by name."""
-    needed = [each for each in suite.scenario if each.data or each.source != "twin"]
+    needed = [each for each in suite.scenario if each.data or each.source not in SIMULATED]
     return {each.data: suite.folder(each) for each in needed}
 
 
@@ -154,56 +278,81 @@ def _inputs(suite: Suite) -> dict[str, str]:
     return sums | {f"weights {name}": sha256(suite.path(name)) for name in sorted(models)}
 
 
-def without(chunk: Chunk, done: Collection[Run]) -> list[Chunk]:
-    """The parts of a chunk that are not done: localizers that lack the same runs stay together."""
-    lacking: dict[tuple[int, ...], list[str]] = {}
-    for name in chunk.entries:
-        runs = tuple(run for run in runs_of(chunk) if (chunk.scenario, name, run) not in done)
-        if runs:
-            lacking.setdefault(runs, []).append(name)
-    parts = []
-    for runs, names in lacking.items():
-        starts = [k for k, run in enumerate(runs) if k == 0 or runs[k - 1] != run - 1]
-        for start, end in zip(starts, [*starts[1:], len(runs)], strict=True):
-            parts.append(replace(chunk, first=runs[start], runs=end - start, entries=tuple(names)))
-    return parts
-
-
 def _run(
-    pool: Pool, suite: Suite, whole: Suite, tasks: list[Task], out: Path, tracks: bool, progress: Progress
+    pool: Pool,
+    suite: Suite,
+    plan: Plan,
+    out: Path,
+    journal: store.Journal,
+    tracks: bool,
+    progress: Progress,
 ) -> None:
-    """Run tasks and write their parts."""
-    names = set(whole.chunks())
-    total, count = sum(map(_size, tasks)), 0
-    progress(0, total, tasks[0].chunk.scenario)
+    """Run what is planned into a journal."""
+    count = _Count(plan, progress)
     work = partial(run_task, suite, _fields(suite, out))
+    tasks: Sequence[Task] = plan
     while tasks:
         again = []
-        for outcome in pool.run(work, tasks, limit_s=2 * suite.time_limit_s + GRACE_S):
+        count.tasks = tasks
+        for outcome in pool.run(work, tasks, limit_s=2 * suite.time_limit_s + GRACE_S, heard=count.heard):
             task = tasks[outcome.index]
             if outcome.failure is not None and outcome.failure.refused is None:
                 again.append(_blamed(task, outcome.failure))
                 continue
-            rows, times, kept = outcome.result()
-            more = {results.TIMES: times, **({results.TRACKS: kept} if tracks else {})}
-            name = results.part_name(task.chunk, names)
-            results.write_part(out, task.chunk.scenario, name, rows, **more)
-            count += _size(task)
-            progress(count, total, task.chunk.scenario)
+            made = outcome.result()
+            journal.add({kind: rows for kind, rows in made.items() if tracks or kind in _ALWAYS})
+            count.finished(outcome.index)
         tasks = again
 
 
-def _size(task: Task) -> int:
-    return task.chunk.runs * len(task.chunk.entries)
+class _Count:
+    """The runs that are made, those of unfinished chunks included."""
+
+    def __init__(self, plan: Plan, progress: Progress) -> None:
+        self.tasks: Sequence[Task] = plan
+        self._total, self._progress = plan.size, progress
+        self._finished, self._begun = 0, dict[int, int]()
+        self._say(plan[0].chunk.scenario)
+
+    def heard(self, index: int, at: str) -> None:
+        """A worker begins with a run."""
+        task = self.tasks[index]
+        self._begun[index] = _before(task, at)
+        self._say(task.chunk.scenario)
+
+    def finished(self, index: int) -> None:
+        """A chunk is finished."""
+        self._begun.pop(index, None)
+        self._finished += self.tasks[index].size
+        self._say(self.tasks[index].chunk.scenario)
+
+    def _say(self, scenario: str) -> None:
+        self._progress(self._finished + sum(self._begun.values()), self._total, scenario)
 
 
-def run_task(suite: Suite, fields: Path | None, task: Task) -> tuple[list[Row], list[Row], list[Row]]:
+_ALWAYS = (store.ROWS, store.TIMES)
+"""Kinds of tables that are kept without `tracks`."""
+
+
+def _before(task: Task, at: str) -> int:
+    """Runs of a task that are made when it says that it begins with one."""
+    run, _, name = at.partition(" ")
+    chunk = task.chunk
+    if not run.isdecimal():
+        return 0
+    place = chunk.entries.index(name) if name in chunk.entries else 0
+    this = (int(run), place)
+    skipped = sum((k, chunk.entries.index(entry)) < this for k, entry in task.done)
+    return (int(run) - chunk.first) * len(chunk.entries) + place - skipped
+
+
+def run_task(suite: Suite, fields: Path | None, task: Task) -> dict[str, list[Row]]:
     """`run_chunk` of a task, in a worker."""
     if fields is not None and not fields.is_dir():
         text = f"{fields}: this machine does not see the folder of results; put it where all workers do"
         raise InputError(text, parameter="out")
     beat(times=SETUP)
-    return run_chunk(suite, task.chunk, fields, task.failures)
+    return run_chunk(suite, task.chunk, fields, task.failures, task.done)
 
 
 def _blamed(task: Task, failure: Failure) -> Task:

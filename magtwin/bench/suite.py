@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
@@ -36,6 +36,9 @@ TABLES = 1000
 SUITES = Path(__file__).parent / "suites"
 """Suites that ship with magtwin, NAME.toml."""
 
+SIMULATED = ("twin", "drawn")
+"""Sources that need no data."""
+
 Seeds = Literal["public", "held-out"]
 
 
@@ -46,8 +49,8 @@ class Scenario:
     name: str
     """Name in results: lower-case letters, digits and hyphens."""
 
-    source: Literal["twin", "magnetic-data", "ship", "1d"] = "twin"
-    """Simulated in a twin, or recorded data."""
+    source: Literal["twin", "drawn", "magnetic-data", "ship", "1d"] = "twin"
+    """Simulated in a twin, or in places that are drawn (`magtwin.bench.drawn`), or recorded data."""
 
     data: str = ""
     """Name of a folder in `[data]`: recorded data, or a survey whose harmonic fit is the true field of the
@@ -73,6 +76,9 @@ class Scenario:
 
     paths: tuple[str, ...] = ("sine", "lawnmower", "figure8", "continuous_cycle", "random")
     """Paths driven in turn: names, or CSV files relative to the suite's file."""
+
+    places: tuple[str, ...] = ()
+    """Places of a drawn scenario, driven in turn: names in `magtwin.bench.drawn.PLACES`. Default: all."""
 
     lab: str = ""
     """Lab on a stage of several: path of its root prim. Default: the only one."""
@@ -191,7 +197,7 @@ class Chunk:
 
     scenario: str
     part: int
-    """Number of the chunk in its scenario, and of its file."""
+    """Number of the chunk in its scenario."""
 
     first: int
     """Its first run."""
@@ -227,6 +233,11 @@ class Suite:
     scenario: tuple[Scenario, ...] = ()
     localizer: tuple[Entry, ...] = ()
     seeds: Seeds = "public"
+    salt_sha256: str = ""
+    """SHA-256 of the salt of held-out places and seeds, which the next release tells. Default: no salt."""
+
+    salt: str = ""
+    """The salt of the runs, in hexadecimal digits; "" for public ones. Not a key of a file."""
 
     def __post_init__(self) -> None:
         for kind, items in (("scenario", self.scenario), ("localizer", self.localizer)):
@@ -266,22 +277,28 @@ class Suite:
     @property
     def sha256(self) -> str:
         """Checksum of all values, without the folders of data."""
-        return hashlib.sha256(
-            json.dumps(_plain(replace(self, data={}, base="")), sort_keys=True).encode()
-        ).hexdigest()
+        plain = _plain(replace(self, data={}, base=""))
+        del plain["salt"]
+        for table in (plain, *plain["scenario"]):  # keys that there were not once, if they are not used
+            for name in ("salt_sha256", "places"):
+                if not table.get(name, True):
+                    del table[name]
+        return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+    def entries_of(self, scenario: Scenario) -> tuple[str, ...]:
+        """Names of the localizers that run on a scenario."""
+        return tuple(e.name for e in self.localizer if not e.scenarios or scenario.name in e.scenarios)
+
+    def chunk_of(self, scenario: Scenario, part: int) -> Chunk:
+        """A chunk of a scenario, by its number."""
+        first, entries = part * self.chunk, self.entries_of(scenario)
+        runs = min(self.chunk, scenario.runs - first)
+        return Chunk(scenario=scenario.name, part=part, first=first, runs=runs, entries=entries)
 
     def chunks(self) -> list[Chunk]:
         """All work, in order."""
-        made = []
-        for scenario in self.scenario:
-            entries = tuple(e.name for e in self.localizer if not e.scenarios or scenario.name in e.scenarios)
-            for part, first in enumerate(range(0, scenario.runs, self.chunk)):
-                runs = min(self.chunk, scenario.runs - first)
-                if entries:
-                    made.append(
-                        Chunk(scenario=scenario.name, part=part, first=first, runs=runs, entries=entries)
-                    )
-        return made
+        parts = ((s, range(-(-s.runs // self.chunk))) for s in self.scenario if self.entries_of(s))
+        return [self.chunk_of(scenario, part) for scenario, numbers in parts for part in numbers]
 
     def limited(
         self,
@@ -291,6 +308,7 @@ class Suite:
         runs: int | None = None,
         seeds: Seeds = "public",
         data: Mapping[str, str] | None = None,
+        salt: str = "",
     ) -> "Suite":
         """A part of the suite.
 
@@ -300,10 +318,12 @@ class Suite:
             runs: Most runs of each scenario.
             seeds: Which seeds.
             data: Folders by name, which replace those of the file.
+            salt: Salt of the held-out seeds, in hexadecimal digits.
 
         Raises:
-            InputError: A scenario is unknown.
+            InputError: A scenario is unknown, or the salt is not that of the suite.
         """
+        self._check_salt(seeds, salt)
         kept = [find("scenario", name, self.scenarios) for name in scenarios] or list(self.scenario)
         if runs is not None:
             kept = [replace(s, runs=min(s.runs, runs)) for s in kept]
@@ -322,14 +342,37 @@ class Suite:
             scenario=tuple(kept),
             localizer=tuple(entries),
             seeds=seeds,
+            salt=salt,
             data={**self.data, **(data or {})},
         )
 
-    def check(self, file: str | os.PathLike[str] = "") -> None:
+    def _check_salt(self, seeds: Seeds, salt: str) -> None:
+        """Refuse another salt than the one whose hash the suite has."""
+        if not (self.salt_sha256 and seeds == "held-out"):
+            if salt:
+                raise InputError("a salt is for held-out seeds of a suite with salt_sha256", parameter="salt")
+            return
+        try:
+            known = hashlib.sha256(bytes.fromhex(salt)).hexdigest() == self.salt_sha256
+        except ValueError:
+            known = False
+        if not (salt and known):
+            text = (
+                "the held-out places are drawn from a salt that the next release tells; give it by `salt` "
+                f"(its SHA-256 begins with {self.salt_sha256[:12]})"
+            )
+            raise InputError(text, parameter="salt")
+
+    def check(
+        self,
+        file: str | os.PathLike[str] = "",
+        make: Callable[[str, Mapping[str, Any]], Any] = load_localizer,
+    ) -> None:
         """Make every localizer and compensator once, and look for scenes, paths and data.
 
         Args:
             file: The suite's file, for error messages. Default: not named.
+            make: Makes a localizer by its method and options.
 
         Raises:
             InputError: There is no localizer; one is unknown or refuses its options; or a scene, a path or
@@ -344,7 +387,7 @@ class Suite:
             with _named_in(file, "localizer", entry.name, ("options", "compensator", "method")):
                 from magtwin.localization.compensators import COMPENSATORS, is_weights
 
-                load_localizer(entry.method, entry.options)
+                make(entry.method, entry.options)
                 if is_weights(entry.compensator):
                     existing(self.path(entry.compensator), "weights file")
                 else:
@@ -355,7 +398,7 @@ class Suite:
                     self.scene(scenario)
                     for path in scenario.paths:
                         check_path(self.path(path))
-            if scenario.data or scenario.source != "twin":
+            if scenario.data or scenario.source not in SIMULATED:
                 self.folder(scenario)
 
     def scene(self, scenario: Scenario) -> Path:

@@ -4,6 +4,7 @@ All draws of a run come from its seed, so that a run is the same in any order an
 """
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,7 +20,7 @@ from magtwin.bench.suite import Scenario
 from magtwin.errors import InputError
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.frames import quat_from_yaw, wrap_angle, yaw_from_quat
-from magtwin.localization.problem import Problem, SensorModel
+from magtwin.localization.problem import FieldBelief, Problem, SensorModel
 from magtwin.run.run import Run
 from magtwin.sim.sensors.noise import decaying
 
@@ -62,13 +63,47 @@ def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: P
     rngs = dict(zip(STREAMS, np.random.default_rng((seed, 1)).spawn(len(STREAMS)), strict=True))
     field = _field(place, fields)
     drive = _drive(scenario, place, seed, session)
+    return case_of(
+        scenario,
+        drive,
+        field,
+        lambda rng: _belief(scenario, place, fields, rng),
+        np.random.default_rng((session, SESSION)).normal(0.0, 1.0, 2),
+        rngs,
+        calibration=_calibration(scenario, place, session),
+    )
+
+
+def case_of(
+    scenario: Scenario,
+    drive: Run,
+    field: AnomalyMap,
+    belief: Callable[[np.random.Generator], FieldBelief | None],
+    iron: Array,
+    rngs: Mapping[str, np.random.Generator],
+    *,
+    calibration: Run | None = None,
+    scale_m: float | None = None,
+) -> Case:
+    """A drive with the errors of a scenario.
+
+    Args:
+        scenario: The scenario.
+        drive: True poses, on-board columns, and the sensor's place in its metadata.
+        field: The true field.
+        belief: Draws what localizers know of it.
+        iron: The session's iron, standard normal, shape (2,).
+        rngs: Generators of all `STREAMS`.
+        calibration: A labelled drive of the session.
+        scale_m: As `Truth.scale_m`.
+    """
     t, pose, cuts, rows = _kidnapped(scenario, drive, rngs["kidnap"])
     true_field = world.certain(field)
     if scenario.moved_nt:
         true_field = world.with_moved_object(field, scenario.moved_nt, rngs["moved"])
     odometry = _odometry(scenario, drive, pose, rows, cuts, t, rngs["odometry"])
     if scenario.truth == "map":
-        iron = np.random.default_rng((session, SESSION)).normal(0.0, 1.0, 2) * scenario.sensor.iron_nt
+        iron = iron * scenario.sensor.iron_nt
         lever = np.add(_lever(drive), scenario.lever_error_m)
         b = _readings(scenario, true_field, t, pose, lever, iron, rngs["noise"])
     else:
@@ -80,9 +115,10 @@ def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: P
         held = (t >= begin) & (t < begin + scenario.stuck_s)
         if held.any():
             b = np.where(held, b[np.argmax(held)], b)
+    signals = drive.select(*ONBOARD) if "odom_v" in drive else {}
     readings = Run(
         {
-            **{name: values[rows] for name, values in drive.select(*ONBOARD).items()},
+            **{name: values[rows] for name, values in signals.items()},
             "t": t,
             "odom_p": np.column_stack([odometry[:, :2], np.zeros(len(t))]),
             "odom_q_xyzw": quat_from_yaw(odometry[:, 2]),
@@ -91,17 +127,17 @@ def twin_case(scenario: Scenario, scene: str, seed: int, session: int, fields: P
         {name: drive.metadata[name] for name in ROBOT if name in drive.metadata},
     )
     problem = Problem(
-        belief=_belief(scenario, place, fields, rngs["map"]),
+        belief=belief(rngs["map"]),
         extent=field.extent,
         prior=drawn_prior(scenario.prior, pose[0], rngs["prior"]),
         sensor=replace(scenario.sensor, lever_arm_m=_lever(drive)),
         odometry=scenario.told_odometry,
         map_length_m=scenario.map_length_m,
         rate_hz=scenario.rate_hz,
-        calibration=_calibration(scenario, place, session),
+        calibration=calibration,
         seed=int(rngs["localizer"].integers(2**31)),
     )
-    truth = Truth(t, pose, true_field, tuple(t[cuts].tolist()))
+    truth = Truth(t, pose, true_field, tuple(t[cuts].tolist()), scale_m)
     return Case(problem, readings, truth)
 
 

@@ -27,6 +27,7 @@ def bench(
     localizer: opt.Names = None,
     runs: opt.Whole | None = None,
     seeds: Literal["public", "held-out"] = "public",
+    salt: str = "",
     data: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
     jobs: opt.Jobs = None,
     shard: opt.Shard = None,
@@ -44,8 +45,8 @@ def bench(
     Parameters
     ----------
     suite
-        TOML file of the suite, or the name of one that ships with magtwin: standard, slam, aprilab,
-        magnetic-data, ship, 1d.
+        TOML file of the suite, or the name of one that ships with magtwin: standard, standard-1, slam,
+        aprilab, magnetic-data, ship, 1d.
     out
         Folder of results to write or continue.
     only
@@ -56,7 +57,9 @@ def bench(
     runs
         Largest number of runs of each scenario. Default: all of the suite.
     seeds
-        public, to choose settings; or held-out, other seeds for a final measurement.
+        public, to choose settings; or held-out, other places and seeds for a final measurement.
+    salt
+        Salt of the held-out places and seeds, in hexadecimal digits, of a suite that has one.
     data
         Folders of the data that the suite needs, as NAME=FOLDER, such as ship=magslam/ship.
     jobs
@@ -69,6 +72,7 @@ def bench(
     from magtwin.parallel import parse_shard
 
     what: Any = {"scenarios": only or (), "localizers": localizer or (), "runs": runs, "seeds": seeds}
+    what["salt"] = salt
     with continued_by_a_repeat(), progress(f"Benchmarking {suite}", "runs") as advance:
         what |= {"data": opt.pairs("data", data, "NAME=FOLDER"), "tracks": not no_tracks, "force": force}
         how: Any = {"jobs": jobs, "dask": dask, "shard": None if shard is None else parse_shard(shard)}
@@ -116,3 +120,42 @@ def compare(a: Path, b: Path) -> Done:
     from magtwin.bench.report import compare_results
 
     return Done(compare_results(a, b))
+
+
+@bench_app.command
+def verify(
+    receipt: Path,
+    *,
+    suite: str | None = None,
+    runs: Whole = 12,
+    salt: str = "",
+    data: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
+    jobs: Jobs = None,
+) -> Done:
+    """Make a sample of the runs of results again, and compare their rows with those of the receipt.
+
+    Ends with status 1 if a row differs.
+
+    Parameters
+    ----------
+    receipt
+        receipt.json in a folder of results, or the folder.
+    suite
+        The suite, if it has scenes, paths or weights of its own. Default: its copy in the folder.
+    runs
+        Number of runs in the sample.
+    salt
+        Salt of the held-out places and seeds, in hexadecimal digits, if the suite has one.
+    data
+        Folders of the data that the suite needs, as NAME=FOLDER, such as ship=magslam/ship.
+    jobs
+        Number of processes. Default: one for each processor.
+    """
+    from magtwin.bench.runner import verify as check
+
+    step("Making the sample again")
+    found = check(
+        receipt, suite=suite, runs=runs, salt=salt, data=pairs("data", data, "NAME=FOLDER"), jobs=jobs
+    )
+    different = next(figure.value for figure in found.figures if figure.name == "different")
+    return Done(found, figures=[each.name for each in found.figures], status=int(bool(different)))

@@ -11,23 +11,22 @@ from magtwin.errors import InputError, hint, is_termination
 from magtwin.extend import Registry
 from magtwin.localization.problem import Localizer, Smoother
 
-LOCALIZERS: Registry[Any] = Registry(
-    "localizer",
-    "localizers",
-    {
-        "bootstrap": "magtwin.localization.particles:Bootstrap",
-        "ekf": "magtwin.localization.ekf:Ekf",
-        "incremental-slam": "magtwin.localization.slam.incremental_slam:IncrementalSlam",
-        "odometry": "magtwin.localization.odometry:Odometry",
-        "point-mass": "magtwin.localization.grid.point_mass:PointMass",
-        "rbpf": "magtwin.localization.particles:RaoBlackwell",
-        "rbpf-iron": "magtwin.localization.particles:RaoBlackwellIron",
-        "rbpf-network": "magtwin.localization.particles:RaoBlackwellNetwork",
-        "ros": "magtwin.ros.localization.ros_node:RosNode",
-        "slam-smoother": "magtwin.localization.slam.slam_smoother:SlamSmoother",
-        "smoother": "magtwin.localization.smoother:MapSmoother",
-    },
-)
+SHIPPED = {
+    "bootstrap": "magtwin.localization.particles:Bootstrap",
+    "ekf": "magtwin.localization.ekf:Ekf",
+    "incremental-slam": "magtwin.localization.slam.incremental_slam:IncrementalSlam",
+    "odometry": "magtwin.localization.odometry:Odometry",
+    "point-mass": "magtwin.localization.grid.point_mass:PointMass",
+    "rbpf": "magtwin.localization.particles:RaoBlackwell",
+    "rbpf-iron": "magtwin.localization.particles:RaoBlackwellIron",
+    "rbpf-network": "magtwin.localization.particles:RaoBlackwellNetwork",
+    "ros": "magtwin.ros.localization.ros_node:RosNode",
+    "slam-smoother": "magtwin.localization.slam.slam_smoother:SlamSmoother",
+    "smoother": "magtwin.localization.smoother:MapSmoother",
+}
+"""Places of the classes of magtwin by name."""
+
+LOCALIZERS: Registry[Any] = Registry("localizer", "localizers", SHIPPED)
 """Classes of localizers and smoothers by name."""
 
 localizer = LOCALIZERS.register

@@ -1,9 +1,10 @@
 """Readings: the on-board columns of a run, one row at a time."""
 
-import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtwin.errors import InputError
 from magtwin.frames import yaw_from_quat
@@ -61,8 +62,15 @@ def onboard(run: Run) -> Run:
     return Run(kept, specs={name: run.spec(name) for name in kept})
 
 
-def readings_of(run: Run) -> Iterator[Reading]:
-    """The readings of a run, one per row, in order.
+Layout = tuple[tuple[str, int, str], ...]
+"""Name, width (0 for plain numbers) and kind of numpy of each column, in the order of a packed row."""
+
+_FIRST = 7  # t, b_nt, the odometry, the disturbance and its sd stand before the columns
+_PLAIN = {"b": bool, "i": int, "u": int}
+
+
+def packed(run: Run) -> tuple[Layout, NDArray[np.float64]]:
+    """The readings of a run as numbers alone, one row per reading, and what is where in a row.
 
     Args:
         run: A run with the columns `NEEDED`. Columns that are not on board are not passed on.
@@ -71,25 +79,35 @@ def readings_of(run: Run) -> Iterator[Reading]:
         InputError: As for `onboard`.
     """
     run = onboard(run)
-    t, b, p = run["t"].tolist(), run["b_measured_nt"].tolist(), run["odom_p"][:, :2].tolist()
-    yaw = np.unwrap(yaw_from_quat(run["odom_q_xyzw"])).tolist()
-    rows = run.rows
-    disturbance = run["disturbance_nt"].tolist() if "disturbance_nt" in run else [0.0] * rows
-    sd = run["disturbance_sd_nt"].tolist() if "disturbance_sd_nt" in run else [0.0] * rows
-    columns = [
-        (name, values.tolist() if values.ndim == 1 else list(values.copy())) for name, values in run.items()
-    ]
-    for k in range(rows):
-        signals = {
-            name: values[k].copy() if isinstance(values[k], np.ndarray) else values[k]
-            for name, values in columns
-        }
-        known = math.isfinite(disturbance[k])
-        yield Reading(
-            t[k],
-            b[k],
-            (p[k][0], p[k][1], yaw[k]),
-            disturbance[k] if known else 0.0,
-            sd[k] if known and math.isfinite(sd[k]) else 0.0,
-            signals,
-        )
+    known, zero = np.ones(run.rows, bool), np.zeros(run.rows)
+    if "disturbance_nt" in run:
+        known = np.isfinite(run["disturbance_nt"])
+    disturbance, sd = (
+        np.where(known & np.isfinite(values), values, 0.0)
+        for values in (run.get(name, zero) for name in ("disturbance_nt", "disturbance_sd_nt"))
+    )
+    yaw = np.unwrap(yaw_from_quat(run["odom_q_xyzw"]))
+    first = run["t"], run["b_measured_nt"], run["odom_p"][:, :2], yaw, disturbance, sd
+    layout = tuple((name, v.shape[1] if v.ndim > 1 else 0, v.dtype.str) for name, v in run.items())
+    return layout, np.column_stack([*first, *run.values()]).astype(float)
+
+
+def unpacked(layout: Layout, row: Sequence[float]) -> Reading:
+    """The reading of a packed row."""
+    signals: dict[str, Any] = {}
+    at = _FIRST
+    for name, width, kind in layout:
+        if width:
+            signals[name] = np.array(row[at : at + width], kind)
+        else:
+            signals[name] = _PLAIN.get(kind[1], float)(row[at])
+        at += width or 1
+    t, b, x, y, yaw, disturbance, sd = row[:_FIRST]
+    return Reading(t, b, (x, y, yaw), disturbance, sd, signals)
+
+
+def readings_of(run: Run) -> Iterator[Reading]:
+    """The readings of a run, one per row, in order; the argument and refusals are those of `packed`."""
+    layout, rows = packed(run)
+    for row in rows.tolist():
+        yield unpacked(layout, row)

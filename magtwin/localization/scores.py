@@ -32,6 +32,9 @@ FAR_M = 0.5
 AWAY_S = 5.0
 """Time that the error must stay above `FAR_M` [s]."""
 
+SCALE_M = 0.6
+"""Distance over which the field of a room changes, for which `NEAR_M` and `FAR_M` hold [m]."""
+
 COVERED = 0.9
 """Probability of the ellipses whose coverage is counted."""
 
@@ -131,6 +134,7 @@ def score(
     global_start: bool = False,
     kidnapped_s: Sequence[float] = (),
     bounds: Bounds | None = None,
+    scale_m: float = SCALE_M,
 ) -> Scores:
     """Score a track.
 
@@ -140,6 +144,7 @@ def score(
         global_start: Whether the start was unknown.
         kidnapped_s: Times of the first readings after the robot was put elsewhere [s].
         bounds: Bounds of the run.
+        scale_m: Distance over which the field changes; errors are near and far in proportion to it.
 
     Raises:
         InputError: The truth has another shape than the track, or is not finite.
@@ -147,13 +152,14 @@ def score(
     truth = np.asarray(truth_pose, float)
     if truth.shape != track.pose.shape or not np.isfinite(truth).all():
         raise InputError(f"truth_pose must be finite and of shape {track.pose.shape}, got {truth.shape}")
+    near_m, far_m = NEAR_M * (scale_m / SCALE_M), FAR_M * (scale_m / SCALE_M)
     t, off = track.t, track.pose - truth
     off[:, 2] = np.arctan2(np.sin(off[:, 2]), np.cos(off[:, 2]))
     error = np.hypot(off[:, 0], off[:, 1])
     moved = np.unique(np.searchsorted(t, sorted(kidnapped_s))).tolist()
     counted, settled, times = np.zeros(len(t), bool), np.zeros(len(t), bool), []
     for begin, end in pairwise([0, *(k for k in moved if 0 < k < len(t)), len(t)]):
-        near = _converged(t[begin:end], error[begin:end])
+        near = _converged(t[begin:end], error[begin:end], near_m)
         times.append(math.nan if near is None else float(t[begin + near] - t[begin]))
         known = begin == 0 and not global_start
         counted[begin + (0 if known or near is None else near) : end] = True
@@ -175,10 +181,10 @@ def score(
         anees_position=float(position.mean()) / 2 if len(position) else math.nan,
         coverage=float(np.mean(position <= -2 * math.log(1 - COVERED))) if len(position) else math.nan,
         converged_s=times[0],
-        diverged=_stays(t, (error > FAR_M) & counted, AWAY_S),
-        diverged_unflagged=_stays(t, (error > FAR_M) & counted & ~track.lost, AWAY_S),
+        diverged=_stays(t, (error > far_m) & counted, AWAY_S),
+        diverged_unflagged=_stays(t, (error > far_m) & counted & ~track.lost, AWAY_S),
         recovery_s=tuple(times[1:]),
-        false_lost=int(np.count_nonzero(begins & settled & (error < FAR_M))),
+        false_lost=int(np.count_nonzero(begins & settled & (error < far_m))),
         lost_share=float(track.lost.mean()),
         step_us=1e6 * track.step_s,
         bound_m={} if bounds is None else {name: bounds.rms(name, counted) for name in BOUNDS},
@@ -289,9 +295,9 @@ def independent(values: Array) -> float:
     return float(np.clip(n / max(2 * total - 1, 1e-9), 1.0, n))
 
 
-def _converged(t: Array, error: Array) -> int | None:
-    """First row from which the error stays below `NEAR_M` for `HELD_S`."""
-    for begin, end in stretches(error < NEAR_M).tolist():
+def _converged(t: Array, error: Array, near_m: float) -> int | None:
+    """First row from which the error stays below `near_m` for `HELD_S`."""
+    for begin, end in stretches(error < near_m).tolist():
         if t[end - 1] - t[begin] >= HELD_S - 1e-9:
             return begin
     return None

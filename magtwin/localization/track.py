@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from magtwin.errors import InputError, RepairWarning, is_termination
 from magtwin.frames import yaw_from_quat
-from magtwin.localization.problem import Array, Estimate, Localizer, Problem, Smoother
+from magtwin.localization.problem import Array, Estimate, Localizer, Problem, Reading, Smoother
 from magtwin.localization.readings import onboard, readings_of
 from magtwin.run.run import Column, Run
 
@@ -85,6 +85,7 @@ def track(
     run: Run,
     *,
     keep_particles: bool = False,
+    name: str = "",
     progress: Callable[[int, int], Any] | None = None,
 ) -> Track:
     """Run an algorithm over the on-board columns of a run.
@@ -93,6 +94,7 @@ def track(
         algorithm: A new `Localizer` or `Smoother`.
         problem: What it is told.
         run: The readings. Other columns than those on board are not passed on.
+        name: What the algorithm is called in errors. Default: its class.
         keep_particles: Keep the samples of a localizer that has `particles()`.
         progress: Called as progress(readings done, all readings).
 
@@ -104,30 +106,23 @@ def track(
     run = onboard(run)
     clouds: list[Array] = []
     estimates: list[Estimate] = []
-    name = type(algorithm).__name__
+    name = name or type(algorithm).__name__
     begin = time.process_time()
     spent = 0.0
     if isinstance(algorithm, Smoother) and not isinstance(algorithm, Localizer):
-        made = _called(f"{name}.run", lambda: algorithm.run(problem, run))
+        made = called(f"{name}.run", lambda: algorithm.run(problem, run))
         if not isinstance(made, Iterable):
             raise LocalizerError(f"{name}.run returned {type(made).__name__}, not a list of Estimates")
-        estimates = _called(f"{name}.run", lambda: list(made))
+        estimates = called(f"{name}.run", lambda: list(made))
         spent = time.process_time() - begin
         if len(estimates) != run.rows:
             raise LocalizerError(f"{name}.run returned {len(estimates)} estimates for {run.rows} readings")
     else:
-        _called(f"{name}.reset", lambda: algorithm.reset(problem))
+        called(f"{name}.reset", lambda: algorithm.reset(problem))
         step = algorithm.step
         for k, reading in enumerate(readings_of(run)):
             begin = time.process_time()
-            try:
-                estimates.append(step(reading))
-            except (Exception, SystemExit) as error:  # whatever the algorithm under test does wrong
-                if is_termination(error):
-                    raise
-                raise LocalizerError(
-                    f"{name}.step raised {type(error).__name__} at t = {reading.t:g} s: {error}"
-                ) from error
+            estimates.append(stepped(name, step, reading))
             spent += time.process_time() - begin
             if keep_particles and hasattr(algorithm, "particles"):
                 clouds.append(np.array(algorithm.particles(), float))
@@ -147,14 +142,33 @@ def track(
     return Track(run["t"], *checked, spent / run.rows, tuple(clouds))
 
 
+def stepped(name: str, step: Callable[[Reading], Estimate], reading: Reading) -> Estimate:
+    """What an algorithm makes of a reading.
+
+    Raises:
+        LocalizerError: It raised.
+    """
+    try:
+        return step(reading)
+    except (Exception, SystemExit) as error:  # whatever the algorithm under test does wrong
+        if is_termination(error):
+            raise
+        raise LocalizerError(
+            f"{name}.step raised {type(error).__name__} at t = {reading.t:g} s: {error}"
+        ) from error
+
+
 def _alike(yaw: Array, other: Array) -> float:
     """Agreement of two headings up to a constant and whole turns: 1 if they turn alike, near 0 if not."""
     return float(np.abs(np.exp(1j * (yaw - other)).mean()))
 
 
-def _called(what: str, work: Callable[[], Any]) -> Any:
+def called(what: str, work: Callable[[], Any]) -> Any:
+    """The result of a method under test; whatever it raises is a LocalizerError."""
     try:
         return work()
+    except LocalizerError:
+        raise
     except InputError as error:  # it says itself what is wrong
         raise LocalizerError(f"{what.partition('.')[0]}: {error}") from error
     except (Exception, SystemExit) as error:

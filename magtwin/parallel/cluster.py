@@ -83,6 +83,7 @@ class Cluster:
         *,
         limit_s: float | None = None,
         progress: Callable[[int, int], Any] | None = None,
+        heard: Callable[[int, str], Any] | None = None,
     ) -> Iterator[Outcome[R]]:
         """As `Pool.run`."""
         from distributed import as_completed

@@ -75,6 +75,7 @@ class Pool(Protocol):
         *,
         limit_s: float | None = None,
         progress: Callable[[int, int], Any] | None = None,
+        heard: Callable[[int, str], Any] | None = None,
     ) -> Iterator[Outcome[R]]:
         """Call a function for every chunk; gives the outcomes in any order.
 
@@ -83,6 +84,7 @@ class Pool(Protocol):
             chunks: What it is called with, one at a time.
             limit_s: Longest time of a chunk, or between two of its beats [s]. Default: no limit.
             progress: Called with the chunks done and all chunks.
+            heard: Called with the number of a chunk and what its function says to `beat`; on this machine.
 
         Raises:
             InputError: Workers cannot start, or the cluster does not fit.

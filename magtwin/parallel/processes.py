@@ -118,6 +118,7 @@ class Processes:
         self._workers: list[_Worker] = []
         self._failed_starts = 0
         self._stopped = False
+        self._heard: Callable[[int, str], Any] | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -144,8 +145,10 @@ class Processes:
         *,
         limit_s: float | None = None,
         progress: Callable[[int, int], Any] | None = None,
+        heard: Callable[[int, str], Any] | None = None,
     ) -> Iterator[Outcome[R]]:
         """As `Pool.run`."""
+        self._heard = heard
         return self.run_pickled(
             pickle.dumps(work, pickle.HIGHEST_PROTOCOL),
             len(chunks),
@@ -226,6 +229,8 @@ class Processes:
                 elif message[0] == "beat":
                     worker.since = time.monotonic()
                     _, worker.at, worker.times = message
+                    if self._heard is not None and index is not None:
+                        self._heard(index, worker.at)
                 else:
                     assert index is not None
                     outcomes.append(_outcome(index, message, worker.at))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from magtwin.bench.leaderboard import compare_rows, standings
+from magtwin.bench.leaderboard import compare_rows, letters, standings
 from magtwin.bench.report import page_of_results
 from magtwin.errors import InputError
 from magtwin.figures.page import to_html
@@ -125,3 +125,15 @@ def test_the_page_names_failures_and_escapes_names():
     titles = [table.title for table in page.sections[1].tables]
     assert titles == ["Accuracy", "Reliability", "Paired differences", "Failures"]
     assert "step raised ZeroDivisionError" in to_html(page)
+
+
+def test_localizers_share_a_letter_if_no_difference_is_shown():
+    """b and c err alike; a is better, and d is worse."""
+    parts = {"c": rows_of("c", 0.1, seed=1), "b": rows_of("b", 0.1, seed=2), "a": rows_of("a", 0.05, seed=3)}
+    parts["d"] = rows_of("d", 0.2, seed=4)
+    rows = {key: np.concatenate([each[key] for each in parts.values()]) for key in parts["a"]}
+    found = letters(rows, standings(rows))
+    assert found["a"] == "a"
+    assert found["b"] == found["c"] == "b"
+    assert found["d"] == "c"
+    assert letters(rows_of("only", 0.1), standings(rows_of("only", 0.1))) == {"only": "a"}

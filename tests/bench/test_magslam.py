@@ -134,7 +134,7 @@ def test_slam_on_the_ship_beats_the_published_filter():
 def test_the_suite_of_the_hand_held_loops_runs_each_recording_once():
     suite = load_suite("1d").limited(localizers=["odometry"], data={"1d": str(HAND)})
     suite.check()
-    rows = [row for chunk in suite.chunks() for row in run_chunk(suite, chunk)[0]]
+    rows = [row for chunk in suite.chunks() for row in run_chunk(suite, chunk)["rows"]]
     assert [(row["scenario"], row["run"], row["status"]) for row in rows] == [
         ("eight", 0, "ok"),
         ("square", 0, "ok"),
