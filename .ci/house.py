@@ -12,13 +12,13 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 
 REACH = {
-    "read_survey": ("magtwin.io.surveys.survey", 8_100),
-    "fit_map": ("magtwin.field.fit.fit", 3_900),
-    "simulate": ("magtwin.twin.simulation", 17_900),
+    "read_survey": ("magtwin.io.surveys.survey", 8_200),
+    "fit_map": ("magtwin.field.fit.fit", 4_030),
+    "simulate": ("magtwin.twin.simulation", 17_700),
     "open_twin": ("magtwin.twin.opening", 20_000),
-    "localize": ("magtwin.tasks.localizing", 18_300),
-    "from_urdf": ("magtwin.author.from_urdf", 11_400),
-    "ros magnetometer": ("magtwin.ros.magnetometer", 14_200),
+    "localize": ("magtwin.tasks.localizing", 18_350),
+    "from_urdf": ("magtwin.author.from_urdf", 11_650),
+    "ros magnetometer": ("magtwin.ros.magnetometer", 14_550),
 }
 """Module of a public function, and the most lines of magtwin that it reaches.
 
@@ -27,34 +27,34 @@ that a table names as text, since these are loaded for one format or method only
 """
 
 ROOMS = {
-    "magtwin": 1_220,
-    "author": 3_600,
-    "bench": 3_220,
-    "cli": 4_920,
+    "magtwin": 1_230,
+    "author": 3_500,
+    "bench": 4_730,
+    "cli": 5_000,
     "export": 3_540,
-    "fetch": 160,
-    "field": 9_190,
-    "files": 1_690,
+    "fetch": 170,
+    "field": 9_450,
+    "files": 1_660,
     "figures": 4_830,
     "io": 10_590,
-    "learn": 9_290,
-    "localization": 5_990,
-    "parallel": 930,
-    "path": 1_420,
-    "report": 460,
-    "ros": 4_320,
-    "run": 1_700,
-    "sim": 8_350,
-    "spec": 2_460,
+    "learn": 9_880,
+    "localization": 6_030,
+    "parallel": 1_110,
+    "path": 1_340,
+    "report": 450,
+    "ros": 4_310,
+    "run": 1_690,
+    "sim": 8_170,
+    "spec": 2_450,
     "tables": 1_250,
-    "tasks": 1_100,
-    "twin": 2_190,
-    "urdf": 10_590,
-    "usd": 6_400,
+    "tasks": 1_110,
+    "twin": 2_120,
+    "urdf": 11_290,
+    "usd": 6_240,
 }
 """Most lines of each room; "magtwin" are the files beside the rooms."""
 
-TESTS = 48_100
+TESTS = 49_700
 """Most lines of tests."""
 
 LONG = 80

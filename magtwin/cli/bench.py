@@ -127,10 +127,10 @@ def verify(
     receipt: Path,
     *,
     suite: str | None = None,
-    runs: Whole = 12,
+    runs: opt.Whole = 12,
     salt: str = "",
     data: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
-    jobs: Jobs = None,
+    jobs: opt.Jobs = None,
 ) -> Done:
     """Make a sample of the runs of results again, and compare their rows with those of the receipt.
 
@@ -155,7 +155,7 @@ def verify(
 
     step("Making the sample again")
     found = check(
-        receipt, suite=suite, runs=runs, salt=salt, data=pairs("data", data, "NAME=FOLDER"), jobs=jobs
+        receipt, suite=suite, runs=runs, salt=salt, data=opt.pairs("data", data, "NAME=FOLDER"), jobs=jobs
     )
     different = next(figure.value for figure in found.figures if figure.name == "different")
     return Done(found, figures=[each.name for each in found.figures], status=int(bool(different)))
