@@ -327,8 +327,8 @@ class Surveyed:
         headings, rows, columns = field.values_nt.shape
         low, high = field.values_nt.min() / 1000, field.values_nt.max() / 1000
         holes = (
-            f"; {self.filled} nodes in steel or where no robot can stand are filled from their neighbours"
-            * (self.filled > 0)
+            f"; {self.filled} of the {field.values_nt.size} values, at nodes in steel or where no robot can "
+            "stand, are filled from their neighbours" * (self.filled > 0)
         )
         return (
             f"surveyed by its own robot: {columns} x {rows} nodes {field.cell_m[0]:g} m apart, {headings} "
