@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from magtwin.author.furniture import FurnitureTable, check_stands
 from magtwin.author.robot import RobotSettings
-from magtwin.author.room import asset_named, check_name, lab_of
+from magtwin.author.room import asset_named, check_name, lab_of, obstacles_in
 from magtwin.author.scene import check_names, check_things
 from magtwin.author.scene_file import EarthTable
 from magtwin.author.tables import table_of, table_of_robot, toml_text
@@ -223,8 +223,8 @@ class Room(Summarized):
                 `susceptibility` [1]; `seed` of the magnetization.
 
         Raises:
-            InputError: A value has the wrong type or size, or the piece reaches beyond the floor's slab or stands
-                in a wall.
+            InputError: A value has the wrong type or size, or the piece reaches beyond the floor's slab or
+                stands in a wall.
         """
         values: dict[str, Any] = {"name": self._free("furniture", kind), **more, "kind": kind}
         values |= {"p_world": _place(at), "yaw": yaw, "material": material or None, "size_m": size_m}
@@ -318,7 +318,7 @@ class Room(Summarized):
         return self._adding("source", values)
 
     def wall(self, start: Point, end: Point, material: str | None = None, **more: Unpack[WallKeys]) -> "Room":
-        """Add a wall from one point to another, each x and y [m], of a `material` such as "brick"; see `Wall`.
+        """Add a wall from one point to another, each x and y [m]; its `material` and more as for `Wall`.
 
         Raises:
             InputError: A value has the wrong type or size, or the wall crosses a door.

@@ -177,9 +177,8 @@ def show_stage(path: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 1
         InputError: The stage is missing, is not USD or shows nothing; or there is no display.
     """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise InputError(
-            f"{path}: there is no display to show it on; magtwin report {path} --out stage.html shows it in a browser"
-        )
+        way = f"magtwin report {path} --out stage.html makes a page of it"
+        raise InputError(f"{path}: there is no display to show it on; {way}")
     plotter = plotter_of(size, window=True)
     try:
         _draw(plotter, path, size, None)

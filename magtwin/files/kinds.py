@@ -188,7 +188,7 @@ def scene_file(scene: str | Path) -> Path:
 
 
 def stage_in(folder: Path) -> Path:
-    """The stage of a folder: the one of its name; in another folder, the one with its own layer, or that has its parts as sublayers.
+    """The stage of a folder: the one of its name, or with its own layer, or whose parts are its sublayers.
 
     A scene NAME is NAME.usda beside NAME_layer.usda; a robot is the only stage of its folder.
     """

@@ -9,7 +9,7 @@ from pathlib import Path as FilePath
 import numpy as np
 from numpy.typing import ArrayLike
 
-from magtwin.errors import InputError, RepairWarning
+from magtwin.errors import InputError, RepairWarning, near
 from magtwin.files.kinds import expected
 from magtwin.path.curves import CASES, PATHS, path_named
 from magtwin.path.polyline import SAME_M, Path, without_repeats
