@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import importlib
+import logging
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -183,7 +184,8 @@ def _bases(twins: Any, network: Network, magnetometer: Kind | None, model_error:
     if single or not hasattr(twins, "__iter__"):
         return [opened(twins, network, magnetometer, model_error, "sweep")]
     made, known, told = list[Twin](), dict[object, Any](), list[str]()
-    for number, each in enumerate(twins):
+    scenes = list(twins)
+    for number, each in enumerate(scenes):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
@@ -197,6 +199,7 @@ def _bases(twins: Any, network: Network, magnetometer: Kind | None, model_error:
             except InputError as error:
                 text = f"scene {number}, counted from 0: {error}"
                 raise InputError(text, parameter=error.parameter) from error
+        logging.getLogger("magtwin").info("opened scene %d of %d", number + 1, len(scenes))
         told += [f"scene {number}, counted from 0: {warning.message}" for warning in caught]
     if not made:
         raise InputError("sweep got no scene", parameter="twin")
