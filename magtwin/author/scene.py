@@ -97,7 +97,8 @@ def author_scene(
         stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, WORLD).GetPrim())
         Usd.ModelAPI(stage.GetDefaultPrim()).SetKind(Kind.Tokens.assembly)
         root.subLayerPaths = [relative_asset(root, layer) for layer in sublayers]
-        cut_heat_map(stage, scene.lab)
+        if scene.lab.floor:
+            cut_heat_map(stage, scene.lab.inside_m)
         for robot in placed.robots:
             _define_robot(stage, robot, scene.map_sha256)
         map_prim = only_prim_with(stage.GetPrimAtPath(WORLD), "anomalyMap")

@@ -1,12 +1,13 @@
 """The coloured floor of a map: a mesh of bounded size, with one variant of colours per heading."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.field.maps.statistics import COLOUR_MAP, apart, colour_limits
-from magtwin.spec.lab import LabSpec
 from magtwin.usd.geometry import linear_from_srgb
 from magtwin.usd.layers import WORLD
 
@@ -66,14 +67,14 @@ def define_heat_map(stage: Usd.Stage, field: AnomalyMap) -> None:
     variants.SetVariantSelection(names[0])
 
 
-def cut_heat_map(stage: Usd.Stage, lab: LabSpec) -> None:
-    """Leave out the quads of the coloured floor whose middle is off a floor with corners."""
+def cut_heat_map(stage: Usd.Stage, inside_m: Callable[[NDArray], NDArray]) -> None:
+    """Leave out the quads of the coloured floor whose middle is off the floor; as `LabSpec.inside_m`."""
     mesh = UsdGeom.Mesh.Get(stage, HEAT_MAP)
-    if not (lab.floor and mesh):
+    if not mesh:
         return
     quads = np.reshape(mesh.GetFaceVertexIndicesAttr().Get(), (-1, 4))
     middles = np.asarray(mesh.GetPointsAttr().Get())[quads, :2].mean(axis=1)
-    quads = quads[lab.inside_m(middles) > 0].astype(np.int32)
+    quads = quads[inside_m(middles) > 0].astype(np.int32)
     if len(quads):
         mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray([4] * len(quads)))
         mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(quads.ravel()))
