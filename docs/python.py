@@ -15,8 +15,8 @@ HERE = Path(__file__).resolve().parent
 BLOCK = re.compile(
     r"^(?:```python\n(?P<code>.*?)^```$|!\[.*?\]\(python/(?P<picture>\w+)\.png\)$)", re.M | re.S
 )
-COLOURS = 64
-"""Colours of a picture, which then has about 20 kB."""
+COLOURS = 256
+"""Colours of a picture, which then has about 40 kB."""
 
 
 def steps(page: str) -> list[tuple[str, str]]:

@@ -117,7 +117,7 @@ through every open door. Its `path_swept` is the share of that floor within 0.25
 names each part of the floor that it cannot enter, and the nearest door.
 
 **A CSV file** is driven unchanged. If it does not fit, the error message proposes a change. `--fit` moves
-the path and, if necessary, shrinks it.
+the path and, if necessary, shrinks it; not to the other side of a wall, which is refused.
 
 ## Walls and doors
 

@@ -6,7 +6,9 @@ keys, checks and meaning.
 
 import fnmatch
 import importlib
+import inspect
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -14,12 +16,12 @@ from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from magtwin.author.furniture import FurnitureTable, check_stands
 from magtwin.author.robot import RobotSettings, mounted
-from magtwin.author.room import asset_named, check_name, lab_of
+from magtwin.author.room import asset_named, check_name, lab_of, obstacles_in
 from magtwin.author.scene import check_things
 from magtwin.author.scene_file import EarthTable
 from magtwin.author.tables import table_of, table_of_robot, toml_text
-from magtwin.author.walls import DoorTable, WallTable, lab_with_walls
-from magtwin.errors import InputError, hint
+from magtwin.author.walls import DoorTable, WallTable, check_not_in_walls, lab_with_walls
+from magtwin.errors import InputError, MismatchWarning, hint
 from magtwin.files.file import existing
 from magtwin.files.outputs import WORKSHOP, output, transaction
 from magtwin.files.settings import from_values, plain
@@ -75,7 +77,6 @@ class WallKeys(TypedDict, total=False):
     name: str
     height_m: float
     thickness_m: float
-    material: str
     magnetization: float
     susceptibility: float
 
@@ -83,6 +84,7 @@ class WallKeys(TypedDict, total=False):
 class DoorKeys(WallKeys, total=False):
     """More of a door, see `Door`."""
 
+    material: str
     width_m: float
     open_deg: float
     hinge: str
@@ -220,7 +222,8 @@ class Room(Summarized):
                 `susceptibility` [1]; `seed` of the magnetization.
 
         Raises:
-            InputError: A value has the wrong type or size, or the piece reaches beyond the floor's slab.
+            InputError: A value has the wrong type or size, or the piece reaches beyond the floor's slab or
+                stands in a wall.
         """
         values: dict[str, Any] = {"name": self._free("furniture", kind), **more, "kind": kind}
         values |= {"p_world": _place(at), "yaw": yaw, "material": material or None, "size_m": size_m}
@@ -231,8 +234,9 @@ class Room(Summarized):
         try:
             check_stands(table.spec(self.table["seed"]), self._lab())
         except InputError as error:
-            far = max(map(abs, table.p_world)) > FAR_M
-            raise InputError(f"{what}: {error}{'; lengths are in metres' if far else ''}") from error
+            far = "; lengths are in metres" if max(map(abs, table.p_world)) > FAR_M else ""
+            text = str(error).replace(f"p_world of {table.name!r} is", "at is").replace("[lab]", "the Room")
+            raise InputError(f"{what}: {text}{far}") from error
         return self._adding("furniture", values)
 
     def desk(self, at: Point, yaw: float = 0.0, **more: Unpack[PieceKeys]) -> "Room":
@@ -312,13 +316,14 @@ class Room(Summarized):
         from_values(SourceSpec, values, f"magnet {values['name']!r}")
         return self._adding("source", values)
 
-    def wall(self, start: Point, end: Point, **more: Unpack[WallKeys]) -> "Room":
-        """Add a wall from one point to another, each x and y [m]; see `Wall` for more.
+    def wall(self, start: Point, end: Point, material: str | None = None, **more: Unpack[WallKeys]) -> "Room":
+        """Add a wall from one point to another, each x and y [m]; its `material` and more as for `Wall`.
 
         Raises:
             InputError: A value has the wrong type or size, or the wall crosses a door.
         """
         values = {"name": self._free("wall", "wall", first=0), **more, "from": start, "to": end}
+        values |= {} if material is None else {"material": material}
         from_values(WallTable, values, f"wall {values['name']!r}")
         return self._adding("wall", values)
 
@@ -504,6 +509,18 @@ class Room(Summarized):
         from_values(cls, values, f"{section} {values['name']!r}")
         return self._adding(section, values)
 
+    def _check_standing(self) -> None:
+        """Refuse walls that cannot stand, and furniture in them."""
+        lab, seed = self._lab(), self.table["seed"]
+        pieces = [
+            from_values(FurnitureTable, each, each["name"]).spec(seed)
+            for each in self.table.get("furniture", ())
+        ]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MismatchWarning)  # of a scene, and told when it is made
+            where = f"room {self.table['name']!r}"
+            check_not_in_walls(pieces, lab, obstacles_in(lab, pieces), where)
+
     def _free(self, section: str, stem: str, *, first: int = 1) -> str:
         """A name that no table of the section has: box, box_2; or wall_0, wall_1."""
         taken = {each["name"] for each in self.table.get(section, ())}
@@ -517,14 +534,21 @@ class Room(Summarized):
                 f"two things of [[{section}]] are called {values['name']!r}; give each its own name"
             )
         room = self._with(**{section: [*held, plain(values)]})
-        if section in ("wall", "door", "window"):
-            room._lab()  # refuses what cannot stand
+        if section in ("wall", "door", "window", "furniture"):
+            room._check_standing()
         return room
 
     def _with(self, **tables: Any) -> "Room":
         room = Room.__new__(Room)
         room.__dict__["table"] = {**self.table, **tables}
         return room
+
+
+for _method in vars(Room).values():  # `help` lists the keys that a method takes
+    for _taken in getattr(_method, "__annotations__", {}).values():
+        _keys = getattr((getattr(_taken, "__args__", None) or [None])[0], "__annotations__", {})
+        if _keys and getattr(_taken, "__origin__", None) is Unpack and _method.__doc__:
+            _method.__doc__ = f"{inspect.cleandoc(_method.__doc__)}\n\nKeys: {', '.join(_keys)}.\n"
 
 
 def changed(scene: Scene, changes: Mapping[str, Any]) -> Scene:

@@ -173,7 +173,8 @@ def _draw(
         from magtwin.io.formats import read_run
 
         named = named_run("", read_run(path), given.get("scene"), path)
-        save(draw_run(named.run, named.field, named.planned), out, force=force)
+        plan = None if named.stage is None else views.plan_in(named.stage)
+        save(draw_run(named.run, named.field, named.planned, plan), out, force=force)
     elif way == "recording":
         from magtwin.io.rerun.viewer import screenshot
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError, find
 from magtwin.field.maps.difference import LISTED, MapDifference
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.maps.statistics import colour_limits
+from magtwin.field.maps.statistics import apart, colour_limits
 from magtwin.figures import style
 from magtwin.figures.canvas import WIDTH_IN, Array, Chart, colour_bar, label, new_figure
 from magtwin.frames import rotate
@@ -111,8 +111,8 @@ def draw_map(
             axes[k].set_title(panel.title)
             legend |= keys
         if quantity != "mask":
-            ticks = scale.levels[:: max(1, len(scale.levels) // 8)]
-            colour_bar(figure, drawn, [axes[k] for k in mine], QUANTITIES[quantity].label, ticks=ticks)
+            beside = [axes[k] for k in mine]
+            colour_bar(figure, drawn, beside, QUANTITIES[quantity].label, ticks=scale.ticks())
     for ax, shown in zip(axes, panels, strict=False):
         ax.set_visible(shown is not None)
     if legend:
@@ -139,7 +139,7 @@ def map_charts(fields: Sequence[AnomalyMap], plan: "FloorPlan | None" = None) ->
 def _draw_alone(ax: Axes, panel: "_Panel", scale: "_Scale", plan: "FloorPlan | None") -> None:
     """A panel with its own bar."""
     drawn, _ = panel.draw(ax, scale, plan)
-    colour_bar(ax.figure, drawn, ax, QUANTITIES[panel.quantity].label, below=True, ticks=scale.levels[::5])
+    colour_bar(ax.figure, drawn, ax, QUANTITIES[panel.quantity].label, below=True, ticks=scale.ticks(5))
     label(ax, "x [m]", "y [m]")
 
 
@@ -206,11 +206,14 @@ def mean_field_nt(field: AnomalyMap) -> Array:
 def draw_mean(ax: Axes, field: AnomalyMap) -> tuple[float, float]:
     """Draw a map's mean over headings pale, with its bar; returns the ends of the scale [nT]."""
     known = mean_field_nt(field)
-    low, high = colour_limits(known)
+    ends = colour_limits(known)
+    low, high = apart(*ends)
     pale = 0.5 * colormaps[style.FIELD_COLOURS](np.linspace(0, 1, 64)) + 0.5
-    colours = LinearSegmentedColormap.from_list("pale", np.minimum(pale, 1.0))
+    flat = ends != (low, high)  # its value is then the middle of a colour
+    colours = LinearSegmentedColormap.from_list("pale", np.minimum(pale, 1.0), 255 if flat else 256)
     mesh = draw_cells(ax, field.x_m, field.y_m, known, colours, vmin=low, vmax=high)
-    colour_bar(ax.figure, mesh, ax, "map, mean over headings [nT]", below=True)
+    one = {"ticks": [(low + high) / 2]} if flat else {}
+    colour_bar(ax.figure, mesh, ax, "map, mean over headings [nT]", below=True, **one)
     return low, high
 
 
@@ -226,6 +229,9 @@ class FloorPlan:
 
     doors: tuple[Array, ...] = ()
 
+    floor: Array | None = None
+    """Corners of a floor that is no rectangle, shape (K, 2): a map is drawn on it alone."""
+
     @classmethod
     def of(cls, scene: Scene, obstacles: Obstacles) -> "FloorPlan":
         """The plan of a scene."""
@@ -237,10 +243,14 @@ class FloorPlan:
             ]
             hull = Obstacles((piece.name,), (np.vstack(corners) + piece.p_world[:2],))
             found[piece.kind.startswith("door")].append(hull.outlines[0])
-        return cls(obstacles.outlines, tuple(found[False]), tuple(found[True]))
+        floor = np.array(scene.lab.corners) if scene.lab.floor else None
+        return cls(obstacles.outlines, tuple(found[False]), tuple(found[True]), floor)
 
     def draw(self, ax: Axes) -> None:
-        """Draw the outlines, and widen the view to hold them."""
+        """Draw the outlines over a map, which is cut to the floor, and widen the view to hold them."""
+        if self.floor is not None:
+            for drawn in ax.collections:
+                drawn.set_clip_path(Polygon(self.floor, transform=ax.transData))
         looks: tuple[tuple[tuple[Array, ...], dict[str, Any]], ...] = (
             (self.pieces, {"fc": style.FAINT, "ec": style.SOFT, "alpha": 0.45, "lw": 0.8}),
             (self.solids, {"fc": style.SOFT, "ec": style.SOFT, "lw": 0.6}),
@@ -464,11 +474,20 @@ class _Scale:
         low, high = colour_limits(known)
         if quantity.about_zero:
             low, high = -max(-low, high), max(-low, high)
-        if not high - low > 1e-6 * abs(high):  # one value everywhere
-            low, high = (low - 0.1 * abs(low), high + 0.1 * abs(high)) if high else (-1.0, 1.0)
-        levels = np.asarray(MaxNLocator(BANDS, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))
+        wide = apart(low, high)
+        if wide == (low, high):
+            levels = np.asarray(MaxNLocator(BANDS, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))
+        else:
+            low, high = wide
+            levels = np.array([low, high])
         beyond = (bool((known < levels[0]).any()), bool((known > levels[-1]).any()))
         return cls(levels, (low, high), colormaps[quantity.colours], EXTEND[beyond])
+
+    def ticks(self, every: int = 0) -> Array:
+        """Values beside the colour bar, by default about 8; of one value everywhere, that alone."""
+        if len(self.levels) == 2:
+            return np.array([round(float(self.levels.mean()), 6)])
+        return self.levels[:: every or max(1, len(self.levels) // 8)]
 
     def draw(self, ax: Axes, x: Array, y: Array, layer: Array) -> ScalarMappable:
         """Filled contours of one layer over its cells, which show beside unknown nodes."""

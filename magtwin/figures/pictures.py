@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from magtwin.errors import InputError
+from magtwin.field.maps.statistics import apart
 from magtwin.figures.canvas import evenly
 from magtwin.figures.style import PALETTE
 from magtwin.files.file import read_bytes
@@ -176,7 +177,8 @@ def show_stage(path: str | os.PathLike[str], *, size: tuple[int, int] = (1600, 1
         InputError: The stage is missing, is not USD or shows nothing; or there is no display.
     """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise InputError(f"{path}: there is no display to show it on; magtwin plot draws it to a file")
+        way = f"magtwin report {path} --out stage.html makes a page of it"
+        raise InputError(f"{path}: there is no display to show it on; {way}")
     plotter = plotter_of(size, window=True)
     try:
         _draw(plotter, path, size, None)
@@ -363,7 +365,7 @@ def _draw(
         aim(plotter, camera, around, size, bar=scale is not None and legend)
         walls.cut(plotter.camera.position, points, more=more)
     if scale is not None and legend:
-        add_bar(plotter, scale.name, (scale.least, scale.greatest), f"field [{scale.unit}]")
+        add_bar(plotter, scale.name, (scale.least, scale.greatest), scale.title("field"))
     return screens if any(subject) else []
 
 
@@ -564,6 +566,7 @@ def add_bar(plotter: Any, colour_map: str, limits: tuple[float, float], title: s
     if colour_map not in colormaps:
         raise InputError(f"the heat map's colourMap {colour_map!r} is none of matplotlib; correct the stage")
     points = pyvista.PolyData(np.zeros((2, 3)))
+    ends, limits = limits, apart(*limits)
     points["field"] = np.array(limits)
     table = pyvista.LookupTable(colour_map, scalar_range=limits)
     actor = plotter.add_mesh(points, scalars="field", cmap=table, opacity=0, show_scalar_bar=False)
@@ -572,8 +575,10 @@ def add_bar(plotter: Any, colour_map: str, limits: tuple[float, float], title: s
     left = min(0.92, 0.975 - 3.6 * letters / plotter.window_size[0])  # numbers of a small picture are wide
     place = {"vertical": True, "position_x": left, "position_y": low, "height": high, "width": 0.05}
     font = {"fmt": "%.0f", "color": INK, "title_font_size": letters, "label_font_size": letters}
+    font |= {} if ends == limits else {"n_labels": 1}
     bar = plotter.add_scalar_bar(title=title, mapper=actor.mapper, **place, **font)
     background = pyvista.Color(BACKGROUND).float_rgb
+    bar.SetTextPad(max(2, letters // 3))  # keeps numbers off the bar
     bar.DrawBackgroundOn()  # keeps it readable in front of anything
     bar.GetBackgroundProperty().SetColor(background)
     bar.GetBackgroundProperty().SetOpacity(0.7)

@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -12,7 +13,7 @@ from matplotlib.figure import Figure
 
 from magtwin.errors import InputError, MismatchWarning
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.figures.canvas import label, new_figure, plain_text, render
+from magtwin.figures.canvas import label, legend_above, new_figure, plain_text, render
 from magtwin.figures.maps import FloorPlan, draw_map, draw_mean
 from magtwin.figures.runs import draw_run
 from magtwin.figures.style import BOUND, INK, styled
@@ -20,7 +21,7 @@ from magtwin.run.run import Run
 from magtwin.spec.scene import Scene
 from magtwin.twin import Twin, open_twin, scene_of
 from magtwin.twin.opening import open_unwritten
-from magtwin.twin.twin import Place, scene_in
+from magtwin.twin.twin import Place, recent, scene_in
 
 LEVEL_NT = 20.0
 """A map that varies less is drawn as a bare floor [nT]."""
@@ -48,8 +49,8 @@ def plot(
         what: A `Run`, an `AnomalyMap`, a twin, or a scene as for `open_twin`.
         anomaly_map: For a run: the map to draw below the path, as the mean over its headings. Default: that
             of the scene.
-        scene: For a run: its scene. Default: that of its metadata, if it is there and has not changed;
-            otherwise the floor is bare.
+        scene: For a run: its scene. Default: what `simulate` drove in this process, else that of its
+            metadata, if it is there and has not changed; otherwise the floor is bare.
         quantity: For a map: "overview", "field", "gradient", "variance", "mask" or "headings"; see
             `magtwin.figures.maps.draw_map`.
         headings: For a map: headings to show [rad]. None shows the map's own, or about four of more than
@@ -87,6 +88,7 @@ def draw_scene(twin: Twin) -> Figure:
     level = known.size == 0 or np.ptp(known) < LEVEL_NT
     if level:  # its noise would fill the scale
         ax.set(xlim=(x0 - 0.2, x1 + 0.2), ylim=(y0 - 0.2, y1 + 0.2))
+        plan = replace(plan, floor=None)
     else:
         draw_mean(ax, twin.field)
     ax.set_aspect("equal")
@@ -109,9 +111,9 @@ def draw_scene(twin: Twin) -> Figure:
         ax.annotate(placed.robot.name, (x, y - radius), (0, -4), fontsize=8, **below)
     same = f"; the map is {known.mean():,.0f} nT everywhere" if level and known.size else ""
     label(ax, "x [m]", "y [m]", title=f"{scene.name}, from above{same}")
-    handles = plan.keys()
-    if handles:
-        figure.legend(handles.values(), handles.keys(), loc="outside upper right", ncols=3, fontsize=8)
+    if handles := plan.keys():
+        ax.set_title(ax.get_title(loc="left"), pad=22)
+        legend_above(ax, 3, handles=[*handles.values()], labels=[*handles])
     return figure
 
 
@@ -129,6 +131,8 @@ def _opened(scene: Twin | Place) -> Twin:
 
 def _scene_of(run: Run) -> Twin | None:
     """The twin of a run's scene if it is there, and is as it was."""
+    if (driven := recent(run.metadata.get("scene_sha256"))) is not None:
+        return driven
     if "scene_file" not in run.metadata:
         return None
     with suppress(InputError):

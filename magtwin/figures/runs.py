@@ -28,6 +28,9 @@ MOST_OTHER = 4
 TRAIL_SHARE = 0.995
 """Share of the readings within the scale of a trail; its ends take the rest."""
 
+WIDE = 1.75
+"""Floors that are longer than this, by their width, are drawn above the graphs of a run."""
+
 LETTER_IN = 0.085
 """Width of a letter of a title, with some room [inch]."""
 
@@ -57,8 +60,15 @@ def draw_run(
         mapped.release()
     place, panels = position_name(run), panels_of(run)
     both = place is not None and bool(panels)
-    figure = canvas.new_figure(14.0 if both else 8.0, 8.0 if len(panels) > 3 or not both else 6.0)
-    sides = figure.subfigures(1, 1 + both, squeeze=False, width_ratios=(1.1, 1)[: 1 + both])[0]
+    tall = 8.0 if len(panels) > 3 or not both else 6.0
+    shape = np.ptp(np.reshape((0, 1, 0, 1) if field is None else field.extent, (2, 2)), axis=1)
+    if both and shape[0] > WIDE * shape[1]:  # the path above the graphs
+        above = 9.0 * shape[1] / shape[0] + 2.8
+        figure = canvas.new_figure(10.0, above + tall)
+        sides = figure.subfigures(2, 1, squeeze=False, height_ratios=(above, tall))[:, 0]
+    else:
+        figure = canvas.new_figure(14.0 if both else 8.0, tall)
+        sides = figure.subfigures(1, 1 + both, squeeze=False, width_ratios=(1.1, 1)[: 1 + both])[0]
     if place is not None:
         if not len(_places(run, place)):
             raise InputError(f"no position is known in {place!r} of the run")
@@ -163,8 +173,8 @@ def _residuals(run: Run) -> list[Panel]:
     if not (np.nan_to_num(told - field).any() and np.nan_to_num(error).any()):
         if exact is None:
             return [Panel("what the map\nlacks [nT]", tuple(lacks), 2.0, None, about_zero=True)]
-        lacks[0][2]["lw"] = 3.0  # nothing is predicted, and the next line covers it
-        lacks.append(("exact − map", exact - field, {"color": style.DATA}))
+        lacks[0][2]["lw"] = 4.5  # nothing is predicted, and the next line lies on it
+        lacks.append(("exact − map", exact - field, {"color": style.DATA, "lw": 1.1, "ls": (0, (4, 2.5))}))
         error, sd, look, title = run[read] - exact, None, {"color": style.DATA}, "reading − exact"
     else:
         lacks.append(("predicted", told - field, {"color": style.MODEL, "lw": 1.0}))

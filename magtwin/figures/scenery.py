@@ -287,7 +287,7 @@ class Scenery:
             two, title = limits not in (None, trail.limits), trail.name.replace(" − ", "\n− ")
             pictures.add_bar(self.plotter, trail.colours, trail.limits, title, "lower" * two)
             if scale is not None and limits is not None and two:
-                pictures.add_bar(self.plotter, scale.name, limits, f"map [{scale.unit}]", "upper")
+                pictures.add_bar(self.plotter, scale.name, limits, scale.title("map"), "upper")
         along = np.gradient(p_xy[rows], axis=0)
         along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
         left = np.column_stack([-along[:, 1], along[:, 0]])

@@ -99,13 +99,21 @@ def floor_plan(source: Source) -> FloorPlan | None:
     for stage in stages:
         if not stage.is_file():
             continue
-        try:
-            opened = open_scene(stage, check_network=False)
-        except InputError:  # a layer without a lab
-            continue
-        if stage == path or opened.scene.map_layer.resolve() == path.resolve():
-            return FloorPlan.of(opened.scene, opened.obstacles)
+        plan = plan_in(stage, None if stage == path else path)
+        if plan is not None:
+            return plan
     return None
+
+
+def plan_in(stage: Path, only: Path | None = None) -> FloorPlan | None:
+    """What stands on the floor of a stage, if it has a lab, and reads the map `only` where one is given."""
+    try:
+        opened = open_scene(stage, check_network=False)
+    except InputError:  # a layer without a lab
+        return None
+    if only is not None and opened.scene.map_layer.resolve() != only.resolve():
+        return None
+    return FloorPlan.of(opened.scene, opened.obstacles)
 
 
 def names_of(a: Path, b: Path) -> tuple[str, str]:

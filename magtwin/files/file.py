@@ -44,6 +44,7 @@ _SPECIAL = (
 
 MADE_BY = {
     "run": "magtwin run lab makes run/run.parquet",
+    "file": "magtwin run lab makes run/run.parquet, and lab is a stage",
     "run, stage, map or recording": "magtwin run lab makes run/run.parquet, and lab is a stage",
     "recording": "magtwin sweep lab makes runs",
     "weights file": "magtwin train makes one",

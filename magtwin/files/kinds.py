@@ -167,7 +167,7 @@ def scene_file(scene: str | Path) -> Path:
     """
     file = Path(scene)
     if file.suffix.lower() == ".toml" and kind_of(file) in (None, TOML, SCENE_TOML):
-        author = f"magtwin scene {scene} --out {file.with_suffix('')}"
+        author = f"magtwin scene {scene} --out {file.with_suffix('')} (in Python, mt.scene_from_toml)"
         raise InputError(
             f"{scene}: describes a scene; author it first: {author}; then give its folder, "
             f"as in magtwin run {file.with_suffix('')}"
@@ -188,14 +188,15 @@ def scene_file(scene: str | Path) -> Path:
 
 
 def stage_in(folder: Path) -> Path:
-    """The stage of a folder: the one of its name; in a folder that was renamed, the one with its own layer.
+    """The stage of a folder: the one of its name, or with its own layer, or whose parts are its sublayers.
 
     A scene NAME is NAME.usda beside NAME_layer.usda; a robot is the only stage of its folder.
     """
     inside = folder / f"{folder.resolve().name}.usda"
     named = folder.glob("*.usda") if folder.is_dir() and not inside.is_file() else ()
     stages = [stage for stage in named if stage.name != "edits.usda"]  # of a robot's user
-    whole = [stage for stage in stages if stage.with_name(f"{stage.stem}_layer.usda").is_file()] or stages
+    whole = [stage for stage in stages if stage.with_name(f"{stage.stem}_layer.usda").is_file()]
+    whole = whole or [stage for stage in stages if b"@./magnetics" in _head(stage)] or stages
     return whole[0] if len(whole) == 1 else inside
 
 

@@ -9,7 +9,7 @@ from pathlib import Path as FilePath
 import numpy as np
 from numpy.typing import ArrayLike
 
-from magtwin.errors import InputError, RepairWarning, hint
+from magtwin.errors import InputError, RepairWarning, near
 from magtwin.files.kinds import expected
 from magtwin.path.curves import CASES, PATHS, path_named
 from magtwin.path.polyline import SAME_M, Path, without_repeats
@@ -62,7 +62,8 @@ def resolve_path(path: "str | os.PathLike[str] | ArrayLike") -> Path:
     file = FilePath(text)
     if file.exists() or file.suffix or file.name != text:
         return read_path_csv(file)
-    raise InputError(f"no path {text!r}; {hint(text, PATHS)}; or give a CSV file with x,y in metres")
+    meant = near(text, PATHS) or f"; known: {', '.join(sorted(PATHS))}"
+    raise InputError(f"no path {text!r}{meant}; give a name, or a CSV file with x,y in metres")
 
 
 def read_path_csv(file: str | os.PathLike[str]) -> Path:

@@ -34,6 +34,7 @@ PLAN_STEP_M = 0.05  # Spacing of the raster on which it is planned [m]
 SWEPT = 0.8  # Least share of the free floor around a scaled path that is not told of
 FEW_CELLS = 4_000  # Cells of a raster of which only shares are told
 LITTLE_M2 = 0.1  # A smaller part of the free floor is not told of [m2]
+SIDE_POINTS = 400  # Points along a fitted path whose side of each wall is checked
 SHIFTS = 13  # Positions to try along each axis for each size
 
 
@@ -98,7 +99,8 @@ def path_in(room: Room, path: str | os.PathLike[str]) -> Path:
         return placed  # as large as the floor
     # Its share of the free floor, by that of the named path on the floor it is made for.
     before = _around(named, Room(LabSpec(floor_m=FLOOR_M), RADIUS_M, Obstacles()))
-    return replace(placed, swept=round(min(1.0, _around(placed, room) / max(before, 1e-9)), 3))
+    share = min(1.0, _around(placed, room) / max(before, 1e-9), _open_to(placed, room))
+    return replace(placed, swept=round(share, 3))
 
 
 def fit_path(path: Path, room: Room) -> Path:
@@ -116,7 +118,32 @@ def fit_path(path: Path, room: Room) -> Path:
     half = np.ptp(path.p_xy, axis=0) / 2
     with np.errstate(divide="ignore"):
         whole = min(1.0, float(np.min(room.reach_m / half)))
-    return _placed(path, room, np.array([whole, whole]), each_way=False)
+    fitted = _placed(path, room, np.array([whole, whole]), each_way=False)
+    _check_side(path, fitted, room.lab)
+    return fitted
+
+
+def _check_side(path: Path, fitted: Path, lab: LabSpec) -> None:
+    """Refuse a fitted path of which a point that was on the floor is now on the other side of a wall."""
+    share = np.linspace(0.0, 1.0, SIDE_POINTS)
+    old, new = path.at(share * path.length), fitted.at(share * fitted.length)
+    on = lab.inside_m(old) > 0
+    for wall in lab.walls:
+        a, b = np.array(wall.start), np.array(wall.end)
+        crossed = on & (_left(a, b, old) != _left(a, b, new)) & (_left(old, new, a) != _left(old, new, b))
+        if crossed.any():
+            i = int(np.flatnonzero(crossed)[0])
+            raise InputError(
+                f"path {path.name} does not fit: the nearest place for it moves its point "
+                f"({old[i, 0]:.3f}, {old[i, 1]:.3f}) m by {np.hypot(*(new - old)[i]):.2f} m, to the other "
+                f"side of {wall.name}; open the door (open_deg), or move the path's points"
+            )
+
+
+def _left(a: Array, b: Array, p: Array) -> NDArray[np.bool_]:
+    """Whether points are to the left of the line from a to b, each of shape (2,) or (N, 2)."""
+    along, to = b - a, p - a
+    return np.asarray(along[..., 0] * to[..., 1] > along[..., 1] * to[..., 0])
 
 
 def check_on_floor(path: Path, lab: LabSpec, footprint_radius_m: float) -> None:
@@ -190,12 +217,13 @@ def check_clear(path: Path, obstacles: Obstacles, footprint_radius_m: float) -> 
     touched = np.flatnonzero(distance < footprint_radius_m - 1e-9)
     if len(touched):
         i = int(touched[0])
-        door = "open the door (open_deg), " if obstacles.names[which[i]].endswith("/leaf") else ""
+        closed = obstacles.names[which[i]].endswith("/leaf")
+        way = "open the door (open_deg)" if closed else "give `fit=True`"
         raise InputError(
             f"path {path.name} runs into {obstacles.names[which[i]]}: {s[i]:.3f} m along it, at "
             f"({p[i, 0]:.3f}, {p[i, 1]:.3f}) m, a robot of radius {footprint_radius_m:g} m is "
-            f"{footprint_radius_m - distance[i]:.3f} m too near; {door}give `fit=True`, or move the "
-            "path or the obstacle"
+            f"{footprint_radius_m - distance[i]:.3f} m too near; {way}, or move the path "
+            "or the obstacle"
         )
 
 
@@ -289,6 +317,20 @@ def _closed_by(room: Room, x: float, y: float) -> str:
         return f"no way is {2 * room.footprint_radius_m:g} m wide; add a [[door]], or move what is in the way"
     name = near.names[which[0]].removesuffix("/leaf")
     return f"the door nearest to it is {name}; open it (open_deg = 90), or make it wider (width_m)"
+
+
+def _open_to(path: Path, room: Room) -> float:
+    """Share of the free floor of a room that is connected with the start of a path."""
+    from scipy import ndimage
+
+    free = _Free(room, 0.0, PLAN_STEP_M)
+    inside = free.inside(room, 0.0)
+    parts, count = ndimage.label(inside)
+    cells = np.argwhere(inside)
+    if not count:
+        return 1.0
+    near = cells[np.argmin(np.hypot(*(free.places(cells) - path.p_xy[0]).T))]
+    return float(np.mean(parts[inside] == parts[tuple(near)]))
 
 
 def _around(path: Path, room: Room) -> float:

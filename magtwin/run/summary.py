@@ -70,7 +70,7 @@ def swept(metadata: Mapping[str, Any]) -> str:
         return f"{share:.1%} of the floor that the robot can reach is within 0.25 m of the path"
     return (
         f"{1 - share:.0%} of the free floor is outside of the path, which was scaled to fit; "
-        'path "coverage" drives all of it'
+        'path "coverage" drives all that can be reached'
     )
 
 

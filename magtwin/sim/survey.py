@@ -321,7 +321,10 @@ class Surveyed:
         field = self.field
         headings, rows, columns = field.values_nt.shape
         low, high = field.values_nt.min() / 1000, field.values_nt.max() / 1000
-        holes = f"; {self.filled} nodes in steel or where no robot can stand are filled from their neighbours"
+        holes = (
+            f"; {self.filled} of the {field.values_nt.size} values, at nodes in steel or where no robot can "
+        )
+        holes += "stand, are filled from their neighbours"
         none = "; nothing is magnetised, so the field is the same everywhere"
         return (
             f"surveyed by its own robot: {columns} x {rows} nodes {field.cell_m[0]:g} m apart, {headings} "

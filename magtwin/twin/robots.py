@@ -30,6 +30,7 @@ def simulate_robots(
     seed: int = 0,
     session: Session | None = None,
     plant: PlantSpec | str | None = None,
+    fit: bool = False,
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
@@ -57,6 +58,7 @@ def simulate_robots(
         seed: As for `simulate`.
         session: As for `simulate`; each robot is drawn independently.
         plant: As for `simulate`; each robot has constants of its own.
+        fit: As for `simulate`, of each robot.
         speed: As for `simulate`, of each robot.
         duration_s: As for `simulate`, of each robot.
         rate_hz: As for `simulate`.
@@ -88,7 +90,7 @@ def simulate_robots(
         find("robot", name, placed)
     twins = {name: led_by(twin, name) for name in placed}
     driven = {
-        name: drive_input((paths or {}).get(name, robot.path or "figure8"), room_of(twins[name]))
+        name: drive_input((paths or {}).get(name, robot.path or "figure8"), room_of(twins[name]), fit=fit)
         for name, robot in placed.items()
     }
     for name, path in driven.items():

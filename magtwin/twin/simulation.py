@@ -26,6 +26,7 @@ from magtwin.twin.twin import (
     Twin,
     checked_seed,
     opened,
+    remember,
     scene_sha256,
 )
 from magtwin.version import __version__
@@ -51,6 +52,7 @@ def simulate(
     seed: int = 0,
     session: Session | None = None,
     plant: PlantSpec | str | None = None,
+    fit: bool = False,
     speed: float = 0.2,
     duration_s: float | None = None,
     rate_hz: float | None = None,
@@ -81,6 +83,7 @@ def simulate(
             on: "hysteresis", "warm-up", "nonlinear", "moving-part", or "drawn" for larger differences between
             sessions; "all" of these; or "nominal" for none. "NAME:SEED" draws the constants of an effect from
             another seed. Or a `PlantSpec`. Default: the scene's. See `draw_plant`.
+        fit: Whether to move and shrink a path until it fits the floor and what stands on it.
         speed: Forward speed on straight parts [m/s].
         duration_s: Duration [s]. Default: once along the path. A longer duration drives further laps.
         rate_hz: Magnetometer readings per second [Hz]. Default: the scene's.
@@ -118,7 +121,8 @@ def simulate(
         warnings.warn(text, MismatchWarning, stacklevel=2)
     twin = in_session(with_plant(twin, plant), session, seed=seed)
     check_field(twin.scene, twin.field)
-    path = drive_input(path, room_of(twin))
+    remember(twin)
+    path = drive_input(path, room_of(twin), fit=fit)
     check_commands(path, twin.magnetometer)
     run = run_scene(
         twin.scene,

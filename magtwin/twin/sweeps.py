@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import importlib
+import logging
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -63,6 +64,7 @@ def sweep(
     seed: int = 0,
     sessions: int | Literal["survey"] | None = None,
     plant: PlantSpec | str | None = None,
+    fit: bool = False,
     speeds: float | Iterable[float] | Literal["drawn"] = 0.2,
     robots: RobotSpec | Twin | Iterable[RobotSpec | Twin] | None = None,
     columns: Iterable[str] | None = None,
@@ -96,6 +98,7 @@ def sweep(
             other. "survey" is the robot as it was when the map was surveyed. Default: each run has its own
             session, drawn from its seed.
         plant: As for `simulate`; all runs have the same constants.
+        fit: As for `simulate`, of each path.
         speeds: Forward speed of each run on straight parts [m/s], or one for all; "drawn" draws a speed for
             each run, as people drive.
         robots: What drives each run, or one for all: a `RobotSpec`, or a twin in a session. Default: the
@@ -143,7 +146,7 @@ def sweep(
         seeds = range(first, first + int(seeds))
     numbers = [checked_seed(number) for number in seeds]
     count = len(numbers)
-    ways = _Ways(each_input(MIXTURE if paths is None else paths))
+    ways = _Ways(each_input(MIXTURE if paths is None else paths), fit)
     if robots is not None and sessions is not None:
         raise InputError("robots are used as they are; give robots or sessions, not both")
     turns = [bases[k % len(bases)] for k in range(count)]
@@ -178,7 +181,8 @@ def _bases(twins: Any, network: Network, magnetometer: Kind | None, model_error:
     if single or not hasattr(twins, "__iter__"):
         return [opened(twins, network, magnetometer, model_error, "sweep")]
     made, known, told = list[Twin](), dict[object, Any](), list[str]()
-    for number, each in enumerate(twins):
+    scenes = list(twins)
+    for number, each in enumerate(scenes):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:
@@ -192,6 +196,7 @@ def _bases(twins: Any, network: Network, magnetometer: Kind | None, model_error:
             except InputError as error:
                 text = f"scene {number}, counted from 0: {error}"
                 raise InputError(text, parameter=error.parameter) from error
+        logging.getLogger("magtwin").info("opened scene %d of %d", number + 1, len(scenes))
         told += [f"scene {number}, counted from 0: {warning.message}" for warning in caught]
     if not made:
         raise InputError("sweep got no scene", parameter="twin")
@@ -218,15 +223,15 @@ def _conditions(base: Twin, common: Mapping[str, Any]) -> "Conditions":
 class _Ways:
     """What runs drive, each path placed in the room of its twin once."""
 
-    def __init__(self, paths: list[Any]) -> None:
-        self._paths, self._known = paths, dict[Any, DriveInput]()
+    def __init__(self, paths: list[Any], fit: bool) -> None:
+        self._paths, self._fit, self._known = paths, fit, dict[Any, DriveInput]()
 
     def of(self, number: int, base: Twin) -> DriveInput:
         """What a run drives in the room of its twin."""
         path = self._paths[number % len(self._paths)]
         key = id(base), path if isinstance(path, str | FilePath) else id(path)
         if key not in self._known:
-            self._known[key] = drive_input(path, room_of(base))
+            self._known[key] = drive_input(path, room_of(base), fit=self._fit)
         return self._known[key]
 
 

@@ -128,6 +128,26 @@ class Twin(Summarized):
         return Summary(title, tuple(rows.items()))
 
 
+MOST_RECENT = 4
+"""Twins in memory whose runs can be drawn without naming their scene."""
+
+_recent: dict[str, Twin] = {}
+
+
+def remember(twin: Twin) -> None:
+    """Keep a twin without a stage of the user's, of the last few, so that `recent` finds it."""
+    if twin.stage is not None and (key := str(twin.metadata.get("scene_sha256", ""))):
+        _recent.pop(key, None)
+        _recent[key] = twin
+        for old in list(_recent)[:-MOST_RECENT]:
+            del _recent[old]
+
+
+def recent(checksum: object) -> Twin | None:
+    """The twin that `simulate` drove in this process, by the `scene_sha256` of its runs."""
+    return _recent.get(str(checksum))
+
+
 def scene_in(place: Any, what: str = "scene must be") -> Any:
     """The scene of a `Room`; a `Scene`, a stage and the name of a file as they are.
 

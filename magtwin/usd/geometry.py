@@ -141,6 +141,13 @@ class ColourScale:
     prim: str = ""
     """Path of the heat map's mesh."""
 
+    heading: str = ""
+    """Heading of the map that is shown [deg]."""
+
+    def title(self, what: str) -> str:
+        """The name of a colour bar."""
+        return f"{what} [{self.unit}]" + (f"\nheading {self.heading}°" if self.heading else "")
+
 
 @translates
 def read_shapes(stage: Usd.Stage | str | os.PathLike[str], *, purposes: Sequence[str] = SHOWN) -> list[Shape]:
@@ -261,7 +268,8 @@ def read_colour_scale(stage: Usd.Stage) -> ColourScale | None:
                 f"{place(prim)}: the colour scale in its customData wants colourMap and unit as texts, "
                 "least and greatest as numbers; correct it"
             )
-        return ColourScale(texts[0], numbers[0], numbers[1], texts[1], str(prim.GetPath()))
+        heading = prim.GetVariantSet("heading").GetVariantSelection().replace("_", ".")
+        return ColourScale(texts[0], numbers[0], numbers[1], texts[1], str(prim.GetPath()), heading)
     return None
 
 

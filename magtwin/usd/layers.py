@@ -130,7 +130,8 @@ def check_stage(path: str | os.PathLike[str], *, composed: bool = True, own: boo
     """
     path = existing(path, "USD file")
     if path.is_dir():
-        raise InputError(f"{path}: a folder; give a USD file in it")
+        held = ", ".join(sorted(each.name for each in path.glob("*.usd*"))[:8])
+        raise InputError(f"{path}: a folder; give a USD file in it" + (f": {held}" if held else ""))
     if path.suffix.lower() not in USD_SUFFIXES:
         if kind := kind_of(path):
             raise refused(path, kind, "USD file")

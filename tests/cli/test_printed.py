@@ -135,7 +135,7 @@ def test_a_command_prints_few_lines_and_typed_again_it_writes_beside_and_says_so
     ("words", "status", "error"),
     [
         ("info no.usda", 1, {"message": "no.usda: no such file", "file": "no.usda"}),
-        ("run lab --path no", 1, {"hint": "or give a CSV file with x,y in metres"}),
+        ("run lab --path no", 1, {"hint": "give a name, or a CSV file with x,y in metres"}),
         ("run lab --duration-s x", 2, {"parameter": "--duration-s"}),
         ("new x.txt", 1, {"file": "x.txt"}),
     ],

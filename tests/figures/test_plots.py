@@ -9,7 +9,7 @@ from magtwin.errors import InputError
 from magtwin.field.maps.difference import difference
 from magtwin.field.maps.map import AnomalyMap
 from magtwin.figures.canvas import save
-from magtwin.figures.maps import draw_difference, draw_map
+from magtwin.figures.maps import FloorPlan, draw_difference, draw_map
 from magtwin.figures.runs import draw_run
 from magtwin.figures.style import MASKED
 from magtwin.run.run import Run
@@ -275,3 +275,21 @@ def test_control_characters_of_a_name_leave_the_picture_well_formed(tmp_path):
     text = (tmp_path / "map.svg").read_text(encoding="utf-8")
     ElementTree.fromstring(text)
     assert not set(text) & set("\x1b\x9b\u202e")
+
+
+def test_a_map_of_one_value_has_one_colour_and_one_number():
+    noise = 1e-9 * np.random.default_rng(0).normal(size=field_map().values_nt.shape)
+    flat = dataclasses.replace(field_map(), values_nt=44_221.5 + noise)
+    figure = draw_map(flat, what="field")
+    bar = figure.axes[-1]
+    assert bar.get_yticks().tolist() == [44_221.5]
+    drawn = [c for ax in figure.axes[:-1] for c in ax.collections]
+    assert all(len(c.get_cmap().colors) == 1 for c in drawn)
+
+
+def test_a_map_is_cut_to_a_floor_with_corners():
+    floor = np.array([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]])
+    figure = draw_map(field_map(), what="field", plan=FloorPlan((), floor=floor))
+    cut = [drawn.get_clip_path() for drawn in figure.axes[0].collections]
+    assert cut
+    assert all(len(path.get_fully_transformed_path().vertices) == len(floor) + 1 for path in cut)

@@ -264,7 +264,7 @@ def test_without_a_display_the_error_names_the_run_or_the_browser(parts, written
         show_run(parts[0], file=source)
     text = str(refused.value)
     assert text.startswith(f"{source}: ")
-    assert text.endswith("; without a display view the .rrd of this run, which a browser shows too")
+    assert text.endswith(f"; without a display, magtwin report {source} --out run.html makes a page of it")
     with pytest.raises(InputError, match=r"opened no window: .*DISPLAY.*; .*rerun --web-viewer --bind 127"):
         show(written)
 

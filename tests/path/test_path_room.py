@@ -13,6 +13,7 @@ from magtwin.path import CASES, PATHS, Path, check_clear, check_on_floor, path_n
 from magtwin.path.room import FLOOR_M, RADIUS_M, Room, fit_path, path_in
 from magtwin.spec.lab import LabSpec
 from magtwin.spec.obstacles import Obstacles
+from magtwin.spec.walls import Wall
 
 
 def box(x: float, y: float, wide: float, deep: float) -> np.ndarray:
@@ -97,6 +98,16 @@ def test_no_room_is_refused():
         path_in(room(0.3, 3.0), "sine")
     with pytest.raises(InputError, match="does not fit between the obstacles on the floor of 2 x 2 m"):
         path_in(room(2.0, 2.0, box(0, 0, 1.6, 1.6)), "sine")
+
+
+def test_a_fit_does_not_change_the_side_of_a_wall():
+    lab = LabSpec(floor_m=(6.0, 4.0), walls=(Wall((1.0, -2.0), (1.0, 2.0), name="brick"),))
+    shut = Room(lab, RADIUS_M, Obstacles(("brick",), (box(1.0, 0.0, 0.1, 4.0),)))
+    with pytest.raises(InputError, match=r"by 1\.\d+ m, to the other side of brick; open the door"):
+        fit_path(Path("line", np.array([[-2.0, 0.0], [2.0, 0.0]])), shut)
+    beside = fit_path(Path("line", np.array([[-2.0, 0.0], [0.85, 0.0]])), shut)
+    assert shut.refusal(beside) is None
+    assert path_in(shut, "figure8").swept == pytest.approx(0.66, abs=0.08)  # a third is behind the wall
 
 
 @pytest.mark.parametrize("placing", [(0.0, 1.0, 0.0, 0.0), (1.0, 1.0), (1.0, 1.0, np.inf, 0.0)])

@@ -96,7 +96,8 @@ def run(
     ----------
     path
         sine, fast_sine, lawnmower, split_lawnmower, figure8, narrow_figure8, continuous_cycle, loops,
-        curvilinear, curvilinear_2; A to E (Table 1 of Penumarti et al. 2025); random (like a human driver,
+        curvilinear, curvilinear_2; coverage (all of the floor that can be reached); A to E
+        (Table 1 of Penumarti et al. 2025); random (like a human driver,
         for one minute by default); a CSV file of x,y [m]; a CSV file of commands t,v,w
         [s, m/s, rad/s], as `magtwin drive` writes; or a run, whose motion is repeated. Named paths are scaled
         to the floor. Default: the path of the scene, else figure8.

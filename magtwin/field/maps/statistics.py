@@ -166,6 +166,15 @@ def colour_limits(values: ArrayLike, outer_percent: float = OUTER_PERCENT) -> tu
     return float(low), float(high)
 
 
+def apart(low: float, high: float) -> tuple[float, float]:
+    """The ends of a scale, moved apart about their middle if they are one value but for rounding."""
+    if high - low > max(1e-5 * max(abs(low), abs(high)), 1e-6):
+        return low, high
+    middle = (low + high) / 2
+    reach = max(abs(middle) / 10, 1.0)
+    return middle - reach, middle + reach
+
+
 def heading_harmonics(field: AnomalyMap, most: int, enough_nt: float) -> tuple[NDArray[np.float64], float]:
     """A map as harmonics of the heading, B = c0 + sum_k ck cos(k h) + sk sin(k h), by least squares.
 

@@ -56,9 +56,11 @@ def show(rrd: str | os.PathLike[str], *, source: str | os.PathLike[str] | None =
     options: dict[str, Any] = {"capture_output": False, "stderr": subprocess.PIPE}
     result = run(command, preexec_fn=ends_with_parent(), **options)
     if result.returncode:
-        advice = f"use a browser: rerun --web-viewer --bind {LOCALHOST} {rrd}"
-        advice = advice if source is None else "view the .rrd of this run, which a browser shows too"
-        text = f"the Rerun viewer opened no window: {_reason(result.stderr)}; without a display {advice}"
+        advice = f"magtwin report {source or rrd} --out run.html makes a page of it"
+        if source is None:
+            advice += f"; or in a browser: rerun --web-viewer --bind {LOCALHOST} {rrd}"
+        reason = _reason(result.stderr)
+        text = f"the Rerun viewer opened no window: {reason}; without a display, {advice}"
         raise InputError(f"{source or rrd}: {text}")
 
 

@@ -1,11 +1,13 @@
 """The coloured floor of a map: a mesh of bounded size, with one variant of colours per heading."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from magtwin.field.maps.map import AnomalyMap
-from magtwin.field.maps.statistics import COLOUR_MAP, colour_limits
+from magtwin.field.maps.statistics import COLOUR_MAP, apart, colour_limits
 from magtwin.usd.geometry import linear_from_srgb
 from magtwin.usd.layers import WORLD
 
@@ -65,6 +67,19 @@ def define_heat_map(stage: Usd.Stage, field: AnomalyMap) -> None:
     variants.SetVariantSelection(names[0])
 
 
+def cut_heat_map(stage: Usd.Stage, inside_m: Callable[[NDArray], NDArray]) -> None:
+    """Leave out the quads of the coloured floor whose middle is off the floor; as `LabSpec.inside_m`."""
+    mesh = UsdGeom.Mesh.Get(stage, HEAT_MAP)
+    if not mesh:
+        return
+    quads = np.reshape(mesh.GetFaceVertexIndicesAttr().Get(), (-1, 4))
+    middles = np.asarray(mesh.GetPointsAttr().Get())[quads, :2].mean(axis=1)
+    quads = quads[inside_m(middles) > 0].astype(np.int32)
+    if len(quads):
+        mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray([4] * len(quads)))
+        mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(quads.ravel()))
+
+
 def _kept(count: int, every: int) -> NDArray[np.intp]:
     """Indices of the vertices among `count` nodes: every few from the first, and the last."""
     return np.unique(np.append(np.arange(0, count, every), count - 1))
@@ -87,7 +102,8 @@ def viridis() -> NDArray[np.float32]:
 
 def colour_index(values: NDArray, valid: NDArray, low: float, high: float) -> NDArray[np.int32]:
     """Rows of `viridis()` for values between `low` and `high`, any shape."""
-    part = (np.where(valid, values, low) - low) / max(high - low, np.finfo(float).tiny)
+    low, high = apart(low, high)
+    part = (np.where(valid, values, low) - low) / (high - low)
     return np.where(valid, np.clip(256 * part, 0, 255).astype(np.int32), 256).astype(np.int32)
 
 
