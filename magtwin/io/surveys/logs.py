@@ -27,12 +27,15 @@ Parts = Mapping[str, Table]
 
 VEHICLES = (".ulg", ".bin", ".h5", ".hdf5")  # Suffixes of the logs that `magtwin.io.surveys.vehicles` reads
 
-TABLES = (".csv", ".txt", *SPREADSHEETS)
+TABLES = (".csv", ".txt", ".jsonl", ".ndjson", *SPREADSHEETS)
 FIELD = ("magnetometer", "magnetic", "mag", "magneticfield", "raw")
 MARKS = ("annotation", "annotations", "waypoint", "waypoints", "mark", "marks", "notes", "events")
 ACCELERATION = ("accelerometer", "acceleration", "acc", "accel", "linear")
 """Words in the names of the tables of a log."""
 
+SEVERAL = (
+    0.05  # Share of rows at the time of another one, and elsewhere, above which there are several things
+)
 MOST_PARTS = 200  # Most tables of a log
 _TRACE = re.compile(rb"^\d+\tTYPE_[A-Z_]+\t", re.M)  # A line of an Android trace: time [ms], sensor, values
 BETWEEN = 0.2  # Share of the rows below which rows with places are marks, and others lie between them
@@ -50,7 +53,7 @@ def is_log(path: Path) -> bool:
 
 def is_survey(path: Path) -> bool:
     """Whether a file is a table or log of another program, and no run, stage or network."""
-    if path.suffix.lower() in (*TABLES, *PARQUET, ".xyz", ".dat", ".tsv"):
+    if path.suffix.lower() in (*TABLES, *PARQUET, ".xyz", ".dat", ".tsv", ".grd", ".asc", ".lvm"):
         return kind_of(path) in (None, TABLE) or is_log(path)
     return kind_of(path) in (None, ARCHIVE) and is_log(path)
 
@@ -206,12 +209,28 @@ def _joined(field: Table, other: Table, labels: list[str]) -> Table:
     """A table with columns of another, between whose rows they are linear in time."""
     at, _ = since_1970(other, other.find("t")[0])
     t, _ = since_1970(field, field.find("t")[0])
-    cells = [between(t, at, other.numbers(label), _period(other, label)) for label in labels]
+    numbers = [other.numbers(label) for label in labels]
+    _check_one(other, at, np.column_stack(numbers[:2]))
+    cells = [between(t, at, some, _period(other, label)) for some, label in zip(numbers, labels, strict=True)]
     columns = (Column(label, values, field.path, None) for label, values in zip(labels, cells, strict=True))
     kept = (column for column in field.columns if column.name not in labels)
     where = f"of {other.path.name}" if other is not field else "between the rows that have them"
     note = f"{' and '.join(labels)} {where}, by time"
     return Table((*kept, *columns), (*field.notes, note), field.comments)
+
+
+def _check_one(table: Table, at: Array, p: Array) -> None:
+    """Refuse places of several things at the same times, such as of several tags in a picture."""
+    known = np.isfinite(at) & np.isfinite(p).all(axis=1)
+    at, p = at[known], p[known]
+    order = np.argsort(at, kind="stable")
+    same = (np.diff(at[order]) == 0) & (np.diff(p[order], axis=0) != 0).any(axis=1)
+    if np.count_nonzero(same) > SEVERAL * len(at):
+        raise InputError(
+            f"{table.path}: has several places at {np.count_nonzero(same)} of {len(at)} times, such as "
+            f"{at[order][np.argmax(same)]:.10g} s; write the rows of one thing into a table t,x,y, and give "
+            "it to the file of the field: --waypoints FILE"
+        )
 
 
 def _period(table: Table, label: str) -> float | None:
