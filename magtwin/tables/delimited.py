@@ -68,6 +68,7 @@ _SLASH = re.compile(r"\s*/([^\w,;]|\w+\s|$)")
 _TRACK = re.compile(r"\s*(line|tie)\s+(?=\S*\d)\S+\s*", re.IGNORECASE)  # Begins a survey line of Geosoft
 _REMARK = re.compile(r"\s*#\s*\w+:\s")  # A comment line `# KEY: VALUE`, as in maps written as CSV
 
+_NMEA = re.compile(r"\s*[$!][A-Z]{4,7},.*\*[0-9A-F]{2}\s*$")  # A sentence of NMEA 0183
 _IN_QUOTES = re.compile(r'(?:^|(?<=[\t;,]))\s*"(?:[^"]|"")*"')  # A quoted word, and no sign of seconds
 _BRACKET = re.compile(r"[\[(]")
 _ERROR = re.compile(r"\s*#(n/?a|nv|value!|div/0!|ref!|num!|name\?|null!)\s*", re.IGNORECASE)
@@ -118,6 +119,11 @@ def read_delimited(
     comments, above, lines, told = _without_comments(lines, notes)
     if not lines:
         raise InputError(f"{path}: empty; expected {wanted}")
+    if sum(bool(_NMEA.match(line)) for _, line in lines[:LOOKED]) > 1:
+        raise InputError(
+            f"{path}:{lines[0][0]}: sentences of NMEA 0183; write its positions and readings as CSV with a "
+            "header time,lat,lon,field"
+        )
     between, prose, rows = _rows(path, lines, told, ended)
     first = _header(rows)
     if prose or first:

@@ -48,7 +48,8 @@ def _surfer(content: bytes) -> tuple[Array, Array, Array]:
         columns, rows = int(words[0]), int(words[1])
         ranges, values = [float(word) for word in words[2:8]], np.array(words[8:], float)
     z = np.where(np.abs(values) >= BLANK, np.nan, values).reshape(rows, columns)
-    return np.linspace(*ranges[:2], columns), np.linspace(*ranges[2:4], rows), z
+    x0, x1, y0, y1 = ranges[:4]
+    return np.linspace(x0, x1, columns), np.linspace(y0, y1, rows), z
 
 
 def _esri(content: bytes) -> tuple[Array, Array, Array]:

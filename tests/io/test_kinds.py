@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.io import savemat
 
 from magtwin.errors import InputError
 from magtwin.io.surveys.readings import read_readings
@@ -63,6 +64,12 @@ def test_angles_with_minutes_and_seconds_are_degrees(tmp_path):
     assert_allclose(np.diff(readings.t), 0.1, atol=1e-6)
 
 
+def test_sentences_of_nmea_are_refused_with_the_way_on(tmp_path):
+    (tmp_path / "b.log").write_text("$PMAGF,080000.00,49001.9,nT*6E\n$SDDBT,10.3,f,3.1,M*30\n" * 5)
+    with pytest.raises(InputError, match=r"b.log:1: sentences of NMEA 0183; .* time,lat,lon,field"):
+        read_readings(tmp_path / "b.log")
+
+
 def test_a_damaged_row_is_no_end_of_a_header(tmp_path):
     rows = [f"{k},{k},49000" for k in range(20)]
     (tmp_path / "s.csv").write_text("\n".join(["x,y,field", *rows[:5], "1,2", *rows]))
@@ -106,3 +113,31 @@ def test_lines_of_json_with_places_in_another_file(tmp_path):
     (tmp_path / "marks.csv").unlink()
     with pytest.raises(InputError, match=r"tags.csv: .*--waypoints"):
         read_readings(tmp_path)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_arrays_of_matlab(tmp_path, axis):
+    mag, pos = B[:, None] * EARTH, np.column_stack([P, np.zeros(N)])
+    data = {"t": T, "mag": mag.T if axis else mag, "pos": pos.T if axis else pos, "fs": 10.0}
+    savemat(tmp_path / "run.mat", {"data": data, "info": "mag in nT", "m_offset": np.zeros(3)})
+    readings = read_readings(tmp_path / "run.mat")
+    assert_allclose(readings.p_xy, P)
+    assert_allclose(readings.b_nt, B)
+    assert_allclose(readings.t, T)
+
+
+def test_groups_of_hdf5_are_joined_by_their_clocks(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    ns = 1_700_000_000_000_000_000 + np.round(1e9 * T).astype(np.int64)
+    with h5py.File(tmp_path / "session.h5", "w") as file:
+        file["magnetometer/timestamp"], file["magnetometer/data"] = ns, B[:, None] * EARTH / 1e9
+        file["magnetometer/data"].attrs["units"] = "T"
+        file["pose/timestamp"], file["pose/position"] = ns[::2], np.column_stack([P, P[:, 0]])[::2]
+        file["pose/orientation_xyzw"] = np.tile([0.0, 0, 0, 1], (N // 2, 1))
+        file["calibration/mag"] = np.zeros((3, 3))
+    readings = read_readings(tmp_path / "session.h5")
+    assert_allclose(readings.p_xy, P[: N - 1], atol=1e-6)
+    assert_allclose(readings.b_nt, B[: N - 1])
+    (tmp_path / "settings.mat").write_bytes(b"MATLAB 5.0")
+    with pytest.raises(InputError, match=r"settings.mat: damaged, or no file of arrays"):
+        read_readings(tmp_path / "settings.mat")

@@ -21,7 +21,7 @@ from magtwin.files.file import sha256
 from magtwin.frames import IDENTITY_XYZW, canonical, quat_conjugate, quat_multiply, rotate, yaw_from_quat
 from magtwin.io.bags.bag import Bag
 from magtwin.io.bags.cdr import NS, Messages
-from magtwin.io.bags.topics import IMU, MAGNITUDE, ODOMETRY, POSE, SCAN, TF, VECTOR, Topic
+from magtwin.io.bags.topics import IMU, MAGNITUDE, ODOMETRY, PATH_KIND, POSE, SCAN, TF, VECTOR, Topic
 from magtwin.io.recording.frames import Frames, frames_of, in_base, kind_of, mount_of
 from magtwin.io.recording.poses import UNIT_WITHIN, check_poses, poses_at, sound_poses
 from magtwin.io.recording.roles import (
@@ -170,7 +170,9 @@ class Recording:
         told = POSE.name in self._names and not self._by_tf
         signal = self._signal(POSE) if POSE in self._topics else None
         estimated = (
-            signal is not None and not told and ROLES[POSE].rank(signal.name) > ROLES[POSE].rank("/pose")
+            signal is not None
+            and not told
+            and (signal.kind == PATH_KIND or ROLES[POSE].rank(signal.name) > ROLES[POSE].rank("/pose"))
         )
         placed = None
         if signal is None or estimated:
@@ -339,6 +341,13 @@ class Recording:
         bag = self._bag
         kinds, listed = ", ".join(kind for kind in topic.reads if "px4" not in kind), bag.listed()
         option = f" or choose one with {ROLES[topic].option}" * bool(ROLES[topic].option)
+        encodings = sorted({one.encoding for one in bag.topics.values()} - {"cdr", "ros1"})
+        if encodings and len(encodings) == len({one.encoding for one in bag.topics.values()}):
+            return InputError(
+                f"{bag.path}: its messages are encoded as {' and '.join(encodings)}; those of ROS 1 and ROS 2 "
+                "(ros1, cdr) are read: write time, x, y and field of the messages as CSV for magtwin map "
+                "import, or record them as ROS messages"
+            )
         return InputError(
             f"{bag.path}: no {ROLES[topic].noun} topic ({kinds}){option}; topics in it: {listed}"
         )

@@ -16,6 +16,7 @@ from magtwin.errors import InputError
 from magtwin.field.survey.folder import LARGEST_TURN
 from magtwin.files.budget import BUDGETS, allowed, check_size
 from magtwin.files.kinds import ARCHIVE, TABLE, kind_of
+from magtwin.io.surveys.arrays import ARRAYS, tables_of_arrays
 from magtwin.io.surveys.places import between
 from magtwin.io.surveys.walk import Marks, marks_of, walked
 from magtwin.tables.labels import meaning_of, words_of
@@ -25,7 +26,7 @@ from magtwin.tables.table import PARQUET, SPREADSHEETS, Column, Table, read_tabl
 Array = NDArray[np.float64]
 Parts = Mapping[str, Table]
 
-VEHICLES = (".ulg", ".bin", ".h5", ".hdf5")  # Suffixes of the logs that `magtwin.io.surveys.vehicles` reads
+VEHICLES = (".ulg", ".bin", *ARRAYS)  # Suffixes of logs of vehicles and of files of arrays
 
 TABLES = (".csv", ".txt", ".jsonl", ".ndjson", *SPREADSHEETS)
 FIELD = ("magnetometer", "magnetic", "mag", "magneticfield", "raw")
@@ -63,7 +64,8 @@ def table_of_log(path: Path, waypoints: Path | None = None, step_m: float | None
     and the length of a step [m] if these have no times.
 
     A log is a table; a folder or a zip of tables, as phyphox and Sensor Logger write them; a trace of an
-    Android phone; or a log of a vehicle: PX4 (.ulg), ArduPilot (.bin) or HDF5.
+    Android phone; or a log of a vehicle: PX4 (.ulg), ArduPilot (.bin) or HDF5; or a
+    file of arrays, such as MATLAB's (.mat).
     """
     if is_log(path):
         parts = _parts(path)
@@ -92,7 +94,8 @@ def _parts(path: Path) -> Parts:
         from magtwin.io.surveys.vehicles import columns_of_log  # imports the library of each kind
 
         check_size(path, "recording")
-        return {path.stem: table_of(path, columns_of_log(path))}
+        columns = {} if path.suffix.lower() == ".mat" else columns_of_log(path)
+        return {path.stem: table_of(path, columns)} if columns else tables_of_arrays(path)
     if path.is_dir():
         files = sorted(file for file in path.iterdir() if file.suffix.lower() in TABLES)[:MOST_PARTS]
         return {file.stem: table for file in files if (table := _read(file)) is not None}
