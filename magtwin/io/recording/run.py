@@ -344,8 +344,8 @@ class Recording:
         encodings = sorted({one.encoding for one in bag.topics.values()} - {"cdr", "ros1"})
         if encodings and len(encodings) == len({one.encoding for one in bag.topics.values()}):
             return InputError(
-                f"{bag.path}: its messages are encoded as {' and '.join(encodings)}; those of ROS 1 and ROS 2 "
-                "(ros1, cdr) are read: write time, x, y and field of the messages as CSV for magtwin map "
+                f"{bag.path}: its messages are encoded as {' and '.join(encodings)}; those of ROS "
+                "1 and 2 (ros1, cdr) are read: write time, x, y and field of the messages as CSV for magtwin map "
                 "import, or record them as ROS messages"
             )
         return InputError(

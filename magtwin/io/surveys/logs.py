@@ -54,7 +54,7 @@ def is_log(path: Path) -> bool:
 
 def is_survey(path: Path) -> bool:
     """Whether a file is a table or log of another program, and no run, stage or network."""
-    if path.suffix.lower() in (*TABLES, *PARQUET, ".xyz", ".dat", ".tsv", ".grd", ".asc", ".lvm"):
+    if path.suffix.lower() in (*TABLES, *PARQUET, ".xyz", ".dat", ".tsv", ".grd", ".asc", ".lvm", ".log"):
         return kind_of(path) in (None, TABLE) or is_log(path)
     return kind_of(path) in (None, ARCHIVE) and is_log(path)
 
