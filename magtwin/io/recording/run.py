@@ -345,8 +345,8 @@ class Recording:
         if encodings and len(encodings) == len({one.encoding for one in bag.topics.values()}):
             return InputError(
                 f"{bag.path}: its messages are encoded as {' and '.join(encodings)}; those of ROS "
-                "1 and 2 (ros1, cdr) are read: write time, x, y and field of the messages as CSV for magtwin map "
-                "import, or record them as ROS messages"
+                "1 and 2 (ros1, cdr) are read: write time, x, y and field as CSV for magtwin map import, or "
+                "record ROS messages"
             )
         return InputError(
             f"{bag.path}: no {ROLES[topic].noun} topic ({kinds}){option}; topics in it: {listed}"
