@@ -17,6 +17,7 @@ from pathlib import Path
 
 from magtwin.errors import InputError
 from magtwin.files.file import existing_file
+from magtwin.tables.body import body_of, cells, degrees_of
 from magtwin.tables.labels import meaning_of, split_label
 from magtwin.tables.quantities import UNITS
 
@@ -66,6 +67,8 @@ _SLASH = re.compile(r"\s*/([^\w,;]|\w+\s|$)")
 _TRACK = re.compile(r"\s*(line|tie)\s+(?=\S*\d)\S+\s*", re.IGNORECASE)  # Begins a survey line of Geosoft
 _REMARK = re.compile(r"\s*#\s*\w+:\s")  # A comment line `# KEY: VALUE`, as in maps written as CSV
 
+_NMEA = re.compile(r"\s*[$!][A-Z]{4,7},.*\*[0-9A-F]{2}\s*$")  # A sentence of NMEA 0183
+_IN_QUOTES = re.compile(r'(?:^|(?<=[\t;,]))\s*"(?:[^"]|"")*"')  # A quoted word, and no sign of seconds
 _BRACKET = re.compile(r"[\[(]")
 _ERROR = re.compile(r"\s*#(n/?a|nv|value!|div/0!|ref!|num!|name\?|null!)\s*", re.IGNORECASE)
 _CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f]")  # Characters that no text has
@@ -113,14 +116,17 @@ def read_delimited(
     comments, above, lines, told = _without_comments(lines, notes)
     if not lines:
         raise InputError(f"{path}: empty; expected {wanted}")
-    between, prose = (told, 0) if told else _separator(lines)
-    if not ended and between and lines[-1][1].count('"') % 2:
-        lines[-1] = (lines[-1][0], lines[-1][1] + '"')
-    rows = _words(path, lines[prose:], between)
+    if sum(bool(_NMEA.match(line)) for _, line in lines[:LOOKED]) > 1:
+        raise InputError(
+            f"{path}:{lines[0][0]}: sentences of NMEA 0183; write its positions and readings as CSV with a "
+            "header time,lat,lon,field"
+        )
+    between, prose, rows = _rows(path, lines, told, ended)
     first = _header(rows)
     if prose or first:
         what = "header" if _is_header(rows[first][1]) else "first row"
         notes.append(f"line {rows[first][0]} as the {what}, and the lines above it as prose")
+    comments += [line for line in lines if line[0] < rows[first][0]]
     above = [comment for comment in above if comment[0] < rows[first][0]]
     names, rows = _names(path, rows[first:], above, between)
     if not rows:
@@ -135,9 +141,50 @@ def read_delimited(
             raise InputError(f"{path}:{number}: {width} values expected, got {len(row)}")
     words = [row for _, row in rows]
     _plain_numbers(names, words, between, notes)
+    _plain_angles(words)
     if not ended and rows[-1][0] == lines[-1][0]:
         _without_begun(rows[-1][0], words, notes)
     return Delimited(path, tuple(names), words, [number for number, _ in rows], tuple(notes), tuple(comments))
+
+
+def _rows(path: Path, lines: _Lines, told: str, ended: bool) -> tuple[str | None, int, _Rows]:
+    """Separator, number of lines of prose above, and the rows, of which the first may be the header.
+
+    If the rows differ in their number of words, or stand below prose without names, they are those of
+    `magtwin.tables.body`.
+    """
+    between, prose = (told, 0) if told else _separator(lines)
+    if not ended and between and lines[-1][1].count('"') % 2:
+        lines[-1] = (lines[-1][0], lines[-1][1] + '"')
+    fault: InputError | None = None
+    try:
+        rows = _words(path, lines[prose:], between)
+        named = not prose or _is_header(rows[0][1])
+        if named and len({len(row) for _, row in rows[:-1]}) < 2:
+            return between, prose, rows
+    except InputError as error:  # prose with unpaired quotes
+        fault = error
+    body = None if told else body_of([line for _, line in lines], _is_row, _is_row_of_units)
+    if body is None:
+        if fault:
+            raise fault
+        return between, prose, rows
+    rows = _words(path, lines[body.begin :], body.mark)
+    for k in (body.units, body.header):
+        if k is not None:
+            words = cells(lines[k][1], body.mark)[: len(rows[-2][1])]
+            words = words if k == body.header or "unit" not in words[0].lower() else ["", *words[1:]]
+            rows.insert(0, (lines[k][0], words))
+    return body.mark, body.header, rows
+
+
+def _is_row(words: list[str]) -> bool:
+    """Whether a row is one of values: most of its words are numbers, dates, times or angles."""
+    return 2 * sum(bool(word.strip()) and not _is_text(word) for word in words) > len(words)
+
+
+def _is_row_of_units(words: list[str]) -> bool:
+    return 2 * sum(map(_is_unit, words)) > len(words)
 
 
 def number_of(word: str) -> float:
@@ -157,7 +204,9 @@ def _is_text(word: str) -> bool:
     """Whether a word is no number, date or time, and not missing."""
     if not math.isinf(number_of(word)) or _is_number(word):
         return False
-    return not (_MOMENT.fullmatch(word) or _COMPASS.fullmatch(word.strip()))
+    if _MOMENT.fullmatch(word) or _COMPASS.fullmatch(word.strip()):
+        return False
+    return degrees_of(word) is None
 
 
 def _is_header(words: list[str]) -> bool:
@@ -173,7 +222,7 @@ def _header(rows: _Rows) -> int:
     rather one that names a column of poses.
     """
     head = [row for _, row in rows[: MOST_ABOVE + 3]]  # with a row of units and one of numbers
-    full = next((k for k, row in enumerate(head) if 2 * sum(map(_is_number, row)) > len(row)), 0)
+    full = next((k for k, row in enumerate(head) if _is_row(row)), 0)
     likely = [k for k, row in enumerate(head[:full]) if _is_names(row, head[full])]
     placed = [k for k in likely if any(meaning_of(word, role) for word in head[k] for role in _PLACED)]
     found = (placed or likely or [0])[-1]
@@ -336,7 +385,7 @@ def _mark(lines: Sequence[str]) -> tuple[str | None, int] | None:
     numbers = all(_COMMA.fullmatch(word) or math.isfinite(number_of(word)) for word in words)
     if len(words) > 1 and numbers and any(map(_COMMA.fullmatch, words)):
         return (None, 0) if (above := _above(lines, "\t")) is None else ("\t", above)
-    bare = [re.sub(r'"[^"]*"', "", line) for line in lines]
+    bare = [_IN_QUOTES.sub("", line) for line in lines]
     found = {mark: above for mark in ";\t," if (above := _above(bare, mark)) is not None}
     if 0 in found.values():
         return next(mark for mark, above in found.items() if not above), 0
@@ -383,6 +432,14 @@ def _plain_numbers(names: list[str], rows: list[list[str]], between: str | None,
     notes.append("numbers with decimal commas")
     for row in rows:
         row[:] = [w.replace(".", "").replace(",", ".") if _COMMA.fullmatch(w) else w for w in row]
+        row[:] = [w.replace(",", ".") if ":" in w and _MOMENT.fullmatch(w) else w for w in row]
+
+
+def _plain_angles(rows: list[list[str]]) -> None:
+    """Make degrees, minutes and seconds decimal degrees."""
+    for column in [k for k, word in enumerate(rows[0]) if degrees_of(word) is not None]:
+        for row in rows:
+            row[column] = row[column] if (angle := degrees_of(row[column])) is None else repr(angle)
 
 
 def _without_begun(number: int, rows: list[list[str]], notes: list[str]) -> None:

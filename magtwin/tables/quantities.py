@@ -87,7 +87,7 @@ class Quantity:
 
 _AT = (
     "p t pos position pose point coord wp map world base robot rs r utm local coordinate koordinate "
-    "coordonnee coordenada coordinata proj"
+    "coordonnee coordenada coordinata proj stage gantry axis grid site"
 )
 _ON_EARTH = "location gps gnss geo wgs84 pos position decimal dd"
 _READINGS = "strength value reading raw sensor measured calibrated avg mean corrected cor"
@@ -114,7 +114,8 @@ QUANTITIES: dict[str, Quantity] = {
     "t": Quantity(
         "t time timestamp stamp seconds_elapsed elapsed time_since_start times seconds elapsed_time "
         "zeit uhrzeit zeitstempel temps heure horodatage tiempo hora tempo ora datetime date_time utc "
-        "utc_time gps_time epoch relative_time",
+        "utc_time gps_time epoch relative_time x_value|elapsed_s rx|rx_time|receive_time|host_time|pc_time "
+        "fecha_hora",
         TIMES,
         _SENT,
     ),
@@ -127,7 +128,9 @@ QUANTITIES: dict[str, Quantity] = {
         "intensita_totale intensidad_total intensite_totale nt ut total_intensity "
         "total_magnetic_intensity magnetic_intensity flux_density mag1 magnetic_flux_density "
         "total_magnetic_field raw_mag mag_raw mag_1 mag_1_uc absolute_magnetic_field intensity "
-        "strength field_strength scalar magnetic_rotation_sensor magnetometer",
+        "strength field_strength scalar magnetic_rotation_sensor magnetometer tfm tmf "
+        "magnetic magnetics mag_value total_magnetic_flux_density sensor_1 top_rdg reading_1 reading|rdg "
+        "lettura messwert lecture lectura",
         FIELDS,
         _READINGS,
     ),

@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtwin.errors import InputError, hint
-from magtwin.files.file import existing
+from magtwin.files.file import existing, existing_file
 from magtwin.report.summary import listed
 from magtwin.tables.delimited import MISSING, QUOTED, number_of, read_delimited
+from magtwin.tables.jsonlines import is_json_lines, rows_of_json
 from magtwin.tables.labels import bare, meaning_of, unit_of
+from magtwin.tables.lattice import is_lattice, nodes_of
 from magtwin.tables.quantities import QUANTITIES
 
 Array = NDArray[np.float64]
@@ -289,6 +291,19 @@ def _seconds(texts: Sequence[str], read: Callable[[str], datetime]) -> list[floa
     return seconds
 
 
+def _lattice_or_json(path: Path, noun: str, content: bytes | None) -> Table | None:
+    """The table of a grid or of lines of JSON; None for other texts."""
+    if content is None:
+        content = existing_file(path, noun, "readings").read_bytes()
+    if is_lattice(content):
+        columns, note = nodes_of(path, content)
+        return Table(tuple(Column(name, cells, path, None) for name, cells in columns.items()), (note,))
+    if not is_json_lines(content):
+        return None
+    keys, lines = rows_of_json(path, content)
+    return Table(tuple(Column(name, cells, path, lines) for name, cells in keys.items()))
+
+
 def read_table(
     path: str | os.PathLike[str],
     noun: str = "file of readings",
@@ -311,6 +326,8 @@ def read_table(
         from magtwin.tables.spreadsheet import text_of_spreadsheet
 
         content = text_of_spreadsheet(existing(path, noun))
+    if (special := _lattice_or_json(Path(path), noun, content)) is not None:
+        return special
     text = read_delimited(path, noun, wanted, content)
     names = text.names or ("",) * len(text.rows[0])
     pairs = zip(names, zip(*text.rows, strict=True), strict=True)

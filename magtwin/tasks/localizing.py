@@ -511,8 +511,11 @@ def prior_of(run: Run, text: str = "tracking", *, seed: int = 0) -> Prior:
 
 
 def lever_arm_of(run: Run) -> tuple[float, float]:
-    """Place of the magnetometer in base_link from the metadata of a run; (0, 0) if it is not there."""
+    """Place of the magnetometer in base_link from the metadata of a run; (0, 0) if it is unknown."""
     x, y, _ = numbers_in(run.metadata, "sensor_m", 3) or (0.0, 0.0, 0.0)
+    by_tf = numbers_in(run.metadata, "tf_sensor_m", 3)
+    if by_tf and "sensor_m" not in run.metadata and math.hypot(*by_tf[:2]) > APART_M:
+        x, y, _ = by_tf  # as `magtwin.io.surveys.readings` places the readings of a map
     return x, y
 
 
@@ -523,8 +526,7 @@ def check_lever_arm(run: Run, lever_arm_m: tuple[float, float]) -> None:
         told = ", ".join(f"{part:.3f}" for part in lever_arm_m)
         warnings.warn(
             f"/tf_static of the recording has the magnetometer at x, y = {x:.3f}, {y:.3f} m in base_link, "
-            f"and the lever arm is {told} m; give --sensor lever_arm_m=[{x:.3f},{y:.3f}], unless the map was "
-            "surveyed by the poses of this robot",
+            f"and the lever arm is {told} m; give --sensor lever_arm_m=[{x:.3f},{y:.3f}]",
             MismatchWarning,
             stacklevel=3,
         )

@@ -5,15 +5,15 @@ import warnings
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from recordings import UPRIGHT, inertial, magnetic, moved, pose, record
+from recordings import UPRIGHT, inertial, magnetic, moved, pose, record, stamped
 from scipy.spatial.transform import Rotation
 
-from magtwin.errors import MismatchWarning, RepairWarning
+from magtwin.errors import InputError, MismatchWarning, RepairWarning
 from magtwin.io.bags import read_bag
 from magtwin.io.recording.frames import StaticFrames
 from magtwin.io.surveys.readings import read_readings
 from magtwin.run.run import Run
-from magtwin.tasks.localizing import check_lever_arm
+from magtwin.tasks.localizing import check_lever_arm, lever_arm_of
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:.*by its size.*:magtwin.errors.RepairWarning"),
@@ -154,6 +154,35 @@ def test_a_ring_of_transforms_or_a_damaged_one_ends_no_reader():
     mount = known.mount("/mag_link")
     assert mount is not None
     assert_array_equal(mount.q_xyzw, one)
+
+
+def test_readings_are_placed_at_the_sensor_also_after_conversion(tmp_path):
+    frames = static(("base_link", "sensor_link", ARM, MOUNTS["turned"]))
+    bag = record(tmp_path / "a.mcap", drive(MOUNTS["turned"]) | frames)
+    run, readings = both(bag)
+    sensor = np.array([p + q.apply(ARM) for p, q in map(true_pose, T)])
+    assert_allclose(readings.p_xy, sensor[:, :2], atol=1e-6)
+    assert "positions at the magnetometer, at (0.1, -0.05, 0.2) m in base_link" in readings.source
+    run.save(tmp_path / "run.parquet")
+    assert_allclose(read_readings(tmp_path / "run.parquet").p_xy, readings.p_xy)
+    assert lever_arm_of(run) == (0.1, -0.05)
+
+
+def test_a_path_gives_the_poses_by_their_stamps(tmp_path):
+    def path(count, stamped_poses=True):
+        fields = {**stamped(T[count - 1], "map"), "poses": count}
+        for k, (p, q) in enumerate(map(true_pose, T[:count])):
+            each = stamped(T[k] if stamped_poses else 0.0, "map")
+            each |= {"pose.position": p, "pose.orientation": q.as_quat()}
+            fields |= {f"poses.{k}.{name}": value for name, value in each.items()}
+        return T[count - 1], "nav_msgs/msg/Path", fields
+
+    topics = {"/mag": drive()["/mag"], "/trajectory": [path(50), path(len(T))]}
+    readings = read_readings(record(tmp_path / "a.mcap", topics))
+    assert_allclose(readings.p_xy, [true_pose(t)[0][:2] for t in T], atol=1e-9)
+    plan = topics | {"/trajectory": [path(len(T), False)]}
+    with pytest.raises(InputError, match="no stamps of their own, as that of a plan"):
+        read_readings(record(tmp_path / "b.mcap", plan))
 
 
 def test_a_lever_arm_other_than_that_of_tf_static_is_warned_of():

@@ -298,6 +298,7 @@ def _of_array(columns: dict[str, Array]) -> dict[str, Array]:
     return {name: values if values.shape[1] == 3 else values[:, 0] for name, values in columns.items()}
 
 
+PATH_KIND = "nav_msgs/msg/Path"  # Whose last message has the poses driven so far, if each has a stamp
 _PX4 = "px4_msgs/msg/"
 _FIELD = "sensor_msgs/msg/MagneticField"
 _ARRAYS = {f"std_msgs/msg/Float{size}MultiArray": {"magnetic_field": "data"} for size in (64, 32)}
@@ -310,6 +311,7 @@ POSE = _carrier(
         "geometry_msgs/msg/TransformStamped": _pose_at("transform.", "translation", "rotation"),
         "nav_msgs/msg/Odometry": _pose_at("pose.pose."),
         _PX4 + "VehicleOdometry": {"mocap_p": "position", "mocap_q_xyzw": "q"},
+        PATH_KIND: _pose_at("poses."),
     },
     turned={_PX4 + "VehicleOdometry": lambda c: _of_ned(c, "mocap")},
     name="/robot/enu/pose",

@@ -9,7 +9,18 @@ from re import findall
 from typing import TYPE_CHECKING
 
 from magtwin.errors import InputError, find
-from magtwin.io.bags.topics import BATTERY, COMMAND, IMU, MAGNITUDE, ODOMETRY, POSE, SCAN, VECTOR, Topic
+from magtwin.io.bags.topics import (
+    BATTERY,
+    COMMAND,
+    IMU,
+    MAGNITUDE,
+    ODOMETRY,
+    PATH_KIND,
+    POSE,
+    SCAN,
+    VECTOR,
+    Topic,
+)
 
 if TYPE_CHECKING:
     from magtwin.io.bags.bag import Bag
@@ -127,7 +138,11 @@ def candidates(role: Topic, bag: "Bag", taken: Collection[str] = ()) -> list[str
     alone = [name for name in names if bag.kinds[name] in sought.kinds]
     named = [name for name in names if name not in alone and _has(name, sought.named)]
     named = [name for name in named if can_be(role, bag, name)]
-    return alone + named if role is POSE else alone or named
+    if role is POSE:
+        poses = [name for name in alone + named if bag.kinds[name] != PATH_KIND]
+        driven = [] if {ODOMETRY.kind} & {*bag.kinds.values()} else alone
+        return poses or driven
+    return alone or named
 
 
 def chosen(role: Topic, names: Collection[str], near: str = "") -> list[str]:
@@ -148,6 +163,8 @@ def can_be(role: Topic, bag: "Bag", name: str) -> bool:
     """Whether the type of a topic's messages can give the columns of a role."""
     try:
         kind, reading = bag.kinds[name], reads_of(role, bag, name)
+        if kind == PATH_KIND:
+            return role is POSE
         known = {leaf.name for leaf in bag.layout(name)} if kind in reading.reads else set()
         return bool(known) and known.issuperset(reading.leaves(kind))
     except Exception:

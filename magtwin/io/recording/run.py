@@ -21,7 +21,7 @@ from magtwin.files.file import sha256
 from magtwin.frames import IDENTITY_XYZW, canonical, quat_conjugate, quat_multiply, rotate, yaw_from_quat
 from magtwin.io.bags.bag import Bag
 from magtwin.io.bags.cdr import NS, Messages
-from magtwin.io.bags.topics import IMU, MAGNITUDE, ODOMETRY, POSE, SCAN, TF, VECTOR, Topic
+from magtwin.io.bags.topics import IMU, MAGNITUDE, ODOMETRY, PATH_KIND, POSE, SCAN, TF, VECTOR, Topic
 from magtwin.io.recording.frames import Frames, frames_of, in_base, kind_of, mount_of
 from magtwin.io.recording.poses import UNIT_WITHIN, check_poses, poses_at, sound_poses
 from magtwin.io.recording.roles import (
@@ -161,7 +161,9 @@ class Recording:
         told = POSE.name in self._names and not self._by_tf
         signal = self._signal(POSE) if POSE in self._topics else None
         rank = ROLES[POSE].rank
-        estimated = signal is not None and not told and rank(signal.name) > rank("/pose")
+        estimated = signal is not None and not told
+        if signal is not None and signal.kind != PATH_KIND:
+            estimated &= rank(signal.name) > rank("/pose")
         placed = self._pose_by_tf() if signal is None or estimated else None
         if signal is not None and placed is None:
             if signal.kind in ODOMETRY.reads:
@@ -323,6 +325,11 @@ class Recording:
         bag = self._bag
         kinds, listed = ", ".join(kind for kind in topic.reads if "px4" not in kind), bag.listed()
         option = f" or choose one with {ROLES[topic].option}" * bool(ROLES[topic].option)
+        encodings = {one.encoding for one in bag.topics.values()}
+        if encodings and not encodings & {"cdr", "ros1"}:
+            text = "those of ROS 1 and 2 (ros1, cdr) are read: write time, x, y and field as CSV for"
+            text = f"its messages are encoded as {' and '.join(sorted(encodings))}; {text}"
+            return InputError(f"{bag.path}: {text} magtwin map import, or record ROS messages")
         noun = ROLES[topic].noun
         return InputError(f"{bag.path}: no {noun} topic ({kinds}){option}; topics in it: {listed}")
 

@@ -1,5 +1,6 @@
 """Signal: the decoded messages of one topic."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from magtwin.errors import InputError
 from magtwin.io.bags.bag import Bag
 from magtwin.io.bags.cdr import Index, Leaf, Messages, decode
-from magtwin.io.bags.topics import Topic
+from magtwin.io.bags.topics import PATH_KIND, Topic
 from magtwin.io.recording.roles import reads_of
 from magtwin.io.recording.timeline import WRONG, Order, in_order
 
@@ -56,6 +57,8 @@ class Signal(NamedTuple):
 
 def read_signal(bag: Bag, name: str, topic: Topic, messages: Messages) -> Signal:
     """The messages of a topic of a bag, decoded for a role. A few that cannot be decoded are left out."""
+    if bag.kinds[name] == PATH_KIND:
+        return _of_path(bag, name, topic, messages)
     topic, leaves = reads_of(topic, bag, name), _layout(bag, name, messages)
     known = {leaf.name: leaf.kind for leaf in leaves}
     stamp = next((leaf for leaf in STAMPS if known.get(leaf) in ("time", "u8")), None)
@@ -74,6 +77,31 @@ def read_signal(bag: Bag, name: str, topic: Topic, messages: Messages) -> Signal
     if stamps is not None and np.count_nonzero(stamps == 0) > max(1, WRONG * len(stamps)):
         stamps = None
     return Signal(name, topic, bag.kinds[name], messages, fields, stamps, broken)
+
+
+def _of_path(bag: Bag, name: str, topic: Topic, messages: Messages) -> Signal:
+    """The poses of the last message of a path, by their stamps; refused if these are those of a plan."""
+    last = messages.take(np.array([len(messages) - 1]))
+    (count,) = decode((*_until(bag.layout(name), "poses"), Leaf("poses", "u4")), last, ["poses"])["poses"]
+    leaves = bag.layout(name, {"poses": count})
+    parts = ("header.stamp", "pose.position", "pose.orientation")
+    every = decode(leaves, last, [f"poses.{k}.{part}" for k in range(count) for part in parts])
+    stamps, p, q = (
+        np.concatenate([np.zeros((0, *shape), kind), *(every[f"poses.{k}.{part}"] for k in range(count))])
+        for part, shape, kind in zip(parts, ((), (3,), (4,)), (np.int64, float, float), strict=True)
+    )
+    if 2 * len(np.unique(stamps)) <= count + 1:
+        raise InputError(
+            f"{bag.path}: topic {name} is a path whose poses have no stamps of their own, as that of a plan; "
+            "choose another topic with --pose-topic"
+        )
+    each = replace(last.take(np.zeros(count, np.intp)), received=stamps)
+    return Signal(name, topic, PATH_KIND, each, {"poses.position": p, "poses.orientation": q}, stamps)
+
+
+def _until(leaves: tuple[Leaf, ...], name: str) -> tuple[Leaf, ...]:
+    """The leaves before one."""
+    return leaves[: [leaf.name for leaf in leaves].index(name)]
 
 
 def _layout(bag: Bag, name: str, messages: Messages) -> tuple[Leaf, ...]:

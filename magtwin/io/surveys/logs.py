@@ -17,6 +17,7 @@ from magtwin.errors import InputError
 from magtwin.field.survey.folder import LARGEST_TURN
 from magtwin.files.budget import BUDGETS, allowed, check_size
 from magtwin.files.kinds import ARCHIVE, TABLE, kind_of
+from magtwin.io.surveys.arrays import ARRAYS, tables_of_arrays
 from magtwin.io.surveys.places import between
 from magtwin.io.surveys.walk import Marks, marks_of, walked
 from magtwin.tables.labels import meaning_of, words_of
@@ -26,14 +27,17 @@ from magtwin.tables.table import PARQUET, SPREADSHEETS, Column, Table, read_tabl
 Array = NDArray[np.float64]
 Parts = Mapping[str, Table]
 
-VEHICLES = (".ulg", ".bin", ".h5", ".hdf5")  # Suffixes of the logs that `magtwin.io.surveys.vehicles` reads
+VEHICLES = (".ulg", ".bin", *ARRAYS)  # Suffixes of logs of vehicles and of files of arrays
 
-TABLES = (".csv", ".txt", *SPREADSHEETS)
+TABLES = (".csv", ".txt", ".jsonl", ".ndjson", *SPREADSHEETS)
 FIELD = ("magnetometer", "magnetic", "mag", "magneticfield", "raw")
 MARKS = ("annotation", "annotations", "waypoint", "waypoints", "mark", "marks", "notes", "events")
 ACCELERATION = ("accelerometer", "acceleration", "acc", "accel", "linear")
 """Words in the names of the tables of a log."""
 
+SEVERAL = (
+    0.05  # Share of rows at the time of another one, and elsewhere, above which there are several things
+)
 MOST_PARTS = 200  # Most tables of a log
 _TRACE = re.compile(rb"^\d+\tTYPE_[A-Z_]+\t", re.M)  # A line of an Android trace: time [ms], sensor, values
 BETWEEN = 0.2  # Share of the rows below which rows with places are marks, and others lie between them
@@ -51,7 +55,7 @@ def is_log(path: Path) -> bool:
 
 def is_survey(path: Path) -> bool:
     """Whether a file is a table or log of another program, and no run, stage or network."""
-    if path.suffix.lower() in (*TABLES, *PARQUET, ".xyz", ".dat", ".tsv"):
+    if path.suffix.lower() in (*TABLES, *PARQUET, ".xyz", ".dat", ".tsv", ".grd", ".asc", ".lvm", ".log"):
         return kind_of(path) in (None, TABLE) or is_log(path)
     return kind_of(path) in (None, ARCHIVE) and is_log(path)
 
@@ -61,7 +65,8 @@ def table_of_log(path: Path, waypoints: Path | None = None, step_m: float | None
     and the length of a step [m] if these have no times.
 
     A log is a table; a folder or a zip of tables, as phyphox and Sensor Logger write them; a trace of an
-    Android phone; or a log of a vehicle: PX4 (.ulg), ArduPilot (.bin) or HDF5.
+    Android phone; or a log of a vehicle: PX4 (.ulg), ArduPilot (.bin) or HDF5; or a
+    file of arrays, such as MATLAB's (.mat).
     """
     parts = _parts(path) if (log := is_log(path)) else {path.stem: read_table(path)}
     name, field = _field(path, parts) if log else (path.stem, parts[path.stem])
@@ -85,7 +90,8 @@ def _parts(path: Path) -> Parts:
         from magtwin.io.surveys.vehicles import columns_of_log  # imports the library of each kind
 
         check_size(path, "recording")
-        return {path.stem: table_of(path, columns_of_log(path))}
+        columns = {} if path.suffix.lower() == ".mat" else columns_of_log(path)
+        return {path.stem: table_of(path, columns)} if columns else tables_of_arrays(path)
     if path.is_dir():
         files = sorted(file for file in path.iterdir() if file.suffix.lower() in TABLES)[:MOST_PARTS]
         return {file.stem: table for file in files if (table := _read(file)) is not None}
@@ -196,12 +202,28 @@ def _joined(field: Table, other: Table, labels: list[str]) -> Table:
     """A table with columns of another, between whose rows they are linear in time."""
     at, _ = since_1970(other, other.find("t")[0])
     t, _ = since_1970(field, field.find("t")[0])
-    cells = [between(t, at, other.numbers(label), _period(other, label)) for label in labels]
+    numbers = [other.numbers(label) for label in labels]
+    _check_one(other, at, np.column_stack(numbers[:2]))
+    cells = [between(t, at, some, _period(other, label)) for some, label in zip(numbers, labels, strict=True)]
     columns = (Column(label, values, field.path, None) for label, values in zip(labels, cells, strict=True))
     kept = (column for column in field.columns if column.name not in labels)
     where = f"of {other.path.name}" if other is not field else "between the rows that have them"
     note = f"{' and '.join(labels)} {where}, by time"
     return Table((*kept, *columns), (*field.notes, note), field.comments)
+
+
+def _check_one(table: Table, at: Array, p: Array) -> None:
+    """Refuse places of several things at the same times, such as of several tags in a picture."""
+    known = np.isfinite(at) & np.isfinite(p).all(axis=1)
+    at, p = at[known], p[known]
+    order = np.argsort(at, kind="stable")
+    same = (np.diff(at[order]) == 0) & (np.diff(p[order], axis=0) != 0).any(axis=1)
+    if np.count_nonzero(same) > SEVERAL * len(at):
+        raise InputError(
+            f"{table.path}: has several places at {np.count_nonzero(same)} of {len(at)} times, such as "
+            f"{at[order][np.argmax(same)]:.10g} s; write the rows of one thing into a table t,x,y, and give "
+            "it to the file of the field: --waypoints FILE"
+        )
 
 
 def _period(table: Table, label: str) -> float | None:

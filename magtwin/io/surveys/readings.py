@@ -19,16 +19,18 @@ from magtwin.field.survey.readings import TAKEN, Readings
 from magtwin.field.survey.saved import load_readings
 from magtwin.files.file import existing, sha256
 from magtwin.files.kinds import READINGS, RUN, SURVEY, expected, kind_of
+from magtwin.frames import rotate
 from magtwin.io.formats import is_bag, read_run
 from magtwin.io.surveys.axes import levelled
 from magtwin.io.surveys.columns import Columns
 from magtwin.io.surveys.logs import is_log, table_of_log
 from magtwin.io.surveys.tabled import left_out, rows_of_table
-from magtwin.run.run import Run
+from magtwin.run.run import Run, numbers_in
 from magtwin.tables.table import PARQUET, read_table
 
 Source = str | os.PathLike[str]
 
+LEVER_M = 0.02  # Level distance of the magnetometer from base_link above which readings are placed at it [m]
 POSE, MAGNITUDE = "/robot/enu/pose", "/robot/qtfm/magnitude"  # In `magtwin.io.bags.topics`
 
 
@@ -91,11 +93,12 @@ def read_readings(
 
 
 def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
-    """The readings of a Run: its measured field at the true pose of base_link.
+    """The readings of a Run: its measured field at the true pose of base_link, or at the sensor's place.
 
     The run has p_world_base, yaw and b_measured_nt, or b_total_nt. Rows whose field is nan (outside the map)
     are left out; rows with lost lock are not good. Of a robot's recording, rows between whose poses there is
-    a gap are left out too, and vectors are read.
+    a gap are left out too, and vectors are read; if its transforms tell where the magnetometer is
+    (`tf_sensor_m` in the metadata), more than `LEVER_M` from base_link, positions are those of the sensor.
     """
     field = next((c for c in ("b_measured_nt", "b_total_nt") if c in run and np.isfinite(run[c]).any()), None)
     if field is None:
@@ -108,6 +111,11 @@ def readings_of_run(run: Run, *, name: str = "", source: str = "") -> Readings:
     if "bag" in run.metadata:
         known &= ~run["flag_pose_lost"]
         about = _recorded(run)
+        lever = np.array(numbers_in(run.metadata, "tf_sensor_m", 3) or (0.0, 0.0, 0.0))
+        if np.hypot(*lever[:2]) > LEVER_M:
+            p = p + rotate(run["q_world_base_xyzw"], lever)
+            at = ", ".join(f"{part:.3g}" for part in lever)
+            about += f"; {TAKEN}positions at the magnetometer, at ({at}) m in base_link by /tf_static"
         if "b_vector_measured_nt" in run:
             vector = levelled(run["b_vector_measured_nt"], run["q_world_base_xyzw"], "body")
             known &= np.isfinite(vector).all(axis=1)

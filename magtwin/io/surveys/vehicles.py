@@ -106,20 +106,19 @@ def _ardupilot(path: Path) -> Columns:
 
 
 def _flight(path: Path) -> Columns:
-    """HDF5: the data sets that `FLIGHT` names, all of one length."""
+    """HDF5: the data sets that `FLIGHT` names, all of one length; none if its groups have others."""
     import h5py
 
     columns: Columns = {}
     with h5py.File(path, "r") as file:
+        inside = any(isinstance(item, h5py.Group) for item in file.values())
         known = {str(name).lower(): item for name, item in file.items() if isinstance(item, h5py.Dataset)}
         for label, names in FLIGHT.items():
             found = next((known[name] for name in names if name in known and known[name].ndim == 1), None)
             if found is not None:
                 columns[label] = np.asarray(found[()], float)
-    if "field [nT]" not in columns:
-        held = ", ".join(sorted(known)[:12]) or "no data sets"
-        tried = ", ".join(FLIGHT["field [nT]"])
-        raise InputError(f"{path}: no field in it under the names {tried}; it has {held}")
+    if "field [nT]" not in columns or (inside and not {"x [m]", "lon"} & columns.keys()):
+        return {}
     rows = len(columns["field [nT]"])
     if "x [m]" in columns:
         columns.pop("lon", None), columns.pop("lat", None)
