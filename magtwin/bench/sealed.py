@@ -101,7 +101,9 @@ class Contestant:
         self._line, theirs = socket.socketpair()
         self._line.settimeout(limit_s)
         task = {"method": entry.method, "options": entry.options, "seed": seed, "buffers": buffers}
-        self._nursery = _nursery(tuple(sys.path), str(Path.cwd()), tuple(modules))
+        here = str(Path.cwd())  # where `load_localizer` looks last
+        path = tuple(sys.path) if here in sys.path else (*sys.path, here)
+        self._nursery = _nursery(path, here, tuple(modules))
         self._pid = self._nursery.fork(
             {**task, "layout": self._rows[0], "memory": jail.MEMORY_BYTES}, theirs.fileno(), memory
         )
