@@ -28,7 +28,7 @@ from magtwin.usd.lab.room import LAB, PHYSICS_SCENE, define_floor_shape, define_
 from magtwin.usd.lab.sources import LOOKS, SOURCES, define_sources
 from magtwin.usd.layers import WORLD, describe_stage, new_stage, relative_asset
 from magtwin.usd.maps.attributes import read_made_from, write_made_from
-from magtwin.usd.maps.heat_map import MAP, cut_heat_map
+from magtwin.usd.maps.heat_map import MAP
 from magtwin.usd.maps.layer import load_map
 from magtwin.usd.robot import load_robot, urdf_of
 from magtwin.usd.scene import check_map
@@ -96,8 +96,6 @@ def author_scene(
         stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, WORLD).GetPrim())
         Usd.ModelAPI(stage.GetDefaultPrim()).SetKind(Kind.Tokens.assembly)
         root.subLayerPaths = [relative_asset(root, layer) for layer in sublayers]
-        if scene.lab.floor:
-            cut_heat_map(stage, scene.lab.inside_m)
         for robot in placed.robots:
             _define_robot(stage, robot, scene.map_sha256)
         map_prim = only_prim_with(stage.GetPrimAtPath(WORLD), "anomalyMap")

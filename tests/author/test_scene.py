@@ -334,7 +334,7 @@ def test_a_toml_of_several_robots_gives_each_its_name_start_path_and_network(own
         ('name = "bob"', 'name = "ann"', "different names, got \"'ann' twice"),
         ('name = "bob"\n', "", r"scene\.toml: \[\[robot\]\] '' needs name = "),
         ('name = "bob"', 'name = "Lab"', "'Lab' has a name that scenes reserve"),
-        ('"figure8"', '"figure9"', r"\[\[robot\]\] 'ann' path: no path 'figure9'; did you mean"),
+        ('"figure8"', '"figure9"', r"\[\[robot\]\] 'ann' path: no path 'figure9' \(did you mean"),
         ('"there.csv"', '"their.csv"', r"'bob' path: .*their\.csv: no such path file; did you"),
         ("start = [0, -1, 0]", "start = [0, -1]", r"start must be a list of 3"),
         ("start = [0, -1, 0]", "strat = [0, -1, 0]", r"unknown key 'strat'; did you mean 'start'"),

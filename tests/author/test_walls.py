@@ -242,7 +242,7 @@ def test_a_closed_door_stops_paths_and_the_lidar_and_is_named(l_room):
     shut = lab_room(replace(lab, doors=(replace(lab.doors[0], open_deg=0.0), lab.doors[1])))
     said = str(shut.refusal(across))
     assert "/wall_0/door_0/leaf" in said
-    assert "; open the door (open_deg), give" in said
+    assert "; open the door (open_deg), or move" in said
     with pytest.warns(
         MismatchWarning, match=r"cannot enter .* m2 .*: the door nearest to it is .*wall_0/door_0; open it"
     ):

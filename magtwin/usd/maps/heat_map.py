@@ -1,7 +1,5 @@
 """The coloured floor of a map: a mesh of bounded size, with one variant of colours per heading."""
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
@@ -65,19 +63,6 @@ def define_heat_map(stage: Usd.Stage, field: AnomalyMap) -> None:
             primvar.Set(Vt.Vec3fArray.FromNumpy(palette[used]))
             primvar.SetIndices(Vt.IntArray.FromNumpy(index.ravel().astype(np.int32)))
     variants.SetVariantSelection(names[0])
-
-
-def cut_heat_map(stage: Usd.Stage, inside_m: Callable[[NDArray], NDArray]) -> None:
-    """Leave out the quads of the coloured floor whose middle is off the floor; as `LabSpec.inside_m`."""
-    mesh = UsdGeom.Mesh.Get(stage, HEAT_MAP)
-    if not mesh:
-        return
-    quads = np.reshape(mesh.GetFaceVertexIndicesAttr().Get(), (-1, 4))
-    middles = np.asarray(mesh.GetPointsAttr().Get())[quads, :2].mean(axis=1)
-    quads = quads[inside_m(middles) > 0].astype(np.int32)
-    if len(quads):
-        mesh.GetFaceVertexCountsAttr().Set(Vt.IntArray([4] * len(quads)))
-        mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(quads.ravel()))
 
 
 def _kept(count: int, every: int) -> NDArray[np.intp]:
