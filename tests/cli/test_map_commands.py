@@ -73,7 +73,7 @@ def test_info_tells_everything_that_a_map_knows(layer, capsys):
     assert (figures["dipoles"], said["notes"]["dipoles"]) == (2, "0.5 to 0.8 m below the floor")
     assert figures["hard_iron_nt"] == 500
     assert figures["soft_iron_nt_nt"] == pytest.approx(0.02)
-    assert figures["extent_m"] == "x -2..2, y -1.5..1.5"
+    assert figures["extent_m"] == [-2, 2, -1.5, 1.5]
     assert metadata["files"] == {"0_map.csv": SHA, "90_map.csv": SHA[::-1]}
     assert metadata["parameters"] == {"depth_m": 0.5, "notes": ["a", 1]}
     about = {"method": "harmonic", "frame": "world", "datum": "the door", "created": "2026-01-01"}

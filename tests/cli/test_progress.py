@@ -154,7 +154,7 @@ def test_json_stays_json_while_progress_goes_to_stderr(long_run, monkeypatch, ca
     from magtwin.io import info
 
     whole = info.info_of
-    monkeypatch.setattr(info, "info_of", lambda path: time.sleep(2.2) or whole(path))
+    monkeypatch.setattr(info, "info_of", lambda path, **how: time.sleep(2.2) or whole(path, **how))
     main(["info", str(long_run), "--json"])
     out, error = capsys.readouterr()
     assert json.loads(out)["figures"]

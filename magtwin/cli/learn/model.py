@@ -86,7 +86,7 @@ def widen(
     return Done(report, out, rest=f"magtwin info {out}")
 
 
-@model_app.command
+@model_app.command(usage="Usage: magtwin model calibrate --map PATH [OPTIONS] RUN [WEIGHTS]")
 @reads_recordings
 def calibrate(
     run: Path,

@@ -61,7 +61,7 @@ def write_localization(
     ):
         send_whole(rec, run)
         if anomaly_map is None:
-            rec.log(PATHS, UPWARDS, static=True)
+            rec.log(PATHS, rr.Transform3D(mat3x3=UPWARDS), static=True)
         else:
             scale = Scale.over(anomaly_map, np.empty(0))
             send_map(rec, anomaly_map, scale, heading_of(anomaly_map, run))

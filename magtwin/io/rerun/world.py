@@ -32,7 +32,7 @@ DOT_HZ = 10.0  # Greatest rate of readings drawn along the path
 SCALE_HEIGHT_M = 1.0  # Height of the colour bar [m]: above desks and chairs, which would hide it on the floor
 ARROW_M_PER_NT = 1.4e-5  # Length of the field arrow: 70 cm for 50 uT
 DRIVEN: Colour = (230, 60, 60)  # Colour of a driven path
-UPWARDS = rr.Transform3D(mat3x3=[[1, 0, 0], [0, -1, 0], [0, 0, 1]])  # Pictures have y downwards
+UPWARDS = [[1, 0, 0], [0, -1, 0], [0, 0, 1]]  # Turn of axes: pictures have y downwards
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def send_map(rec: rr.RecordingStream, field: AnomalyMap, scale: Scale, heading: 
     place = rr.Transform3D(translation=(x0, -y1, 0), scale=((x1 - x0) / width, (y1 - y0) / height, 1))
     rec.log("floor/map", place, static=True)
     rec.log("floor/map", rr.Image(pixels, draw_order=-1.0), static=True)
-    rec.log("floor/paths", UPWARDS, static=True)
+    rec.log("floor/paths", rr.Transform3D(mat3x3=UPWARDS), static=True)
 
 
 def _pixels(field: AnomalyMap) -> tuple[float, int, int]:
