@@ -9,7 +9,7 @@ import pytest
 
 from magtwin.errors import InputError
 from magtwin.files.file import existing
-from magtwin.files.kinds import SCENE_TOML, kind_of
+from magtwin.files.kinds import SCENE_TOML, kind_of, stage_in
 from magtwin.files.outputs import check_free, output
 from magtwin.files.settings import from_table, read_toml
 
@@ -151,3 +151,14 @@ def test_levels_after_a_text_that_ends_in_a_quote_are_counted(quote, tmp_path):
     text = f"x = [{3 * quote}a{4 * quote}, {'[' * 40}{']' * 40}, {2 * quote}]"
     with pytest.raises(InputError, match="nests deeper than 16 levels"):
         read_cart(tmp_path, text)
+
+
+def test_the_stage_of_a_folder_is_the_scene_and_not_a_part_of_it_with_the_folders_name(tmp_path):
+    folder = tmp_path / "room"
+    folder.mkdir()
+    (folder / "room.usda").write_text("#usda 1.0\n")
+    assert stage_in(folder) == folder / "room.usda"
+    (folder / "l_room.usda").write_text("#usda 1.0\n(\n    subLayers = [@./magnetics.usda@]\n)\n")
+    assert stage_in(folder) == folder / "l_room.usda"
+    (folder / "room_layer.usda").write_text("#usda 1.0\n")
+    assert stage_in(folder) == folder / "room.usda"

@@ -193,11 +193,10 @@ def stage_in(folder: Path) -> Path:
     A scene NAME is NAME.usda beside NAME_layer.usda; a robot is the only stage of its folder.
     """
     inside = folder / f"{folder.resolve().name}.usda"
-    named = folder.glob("*.usda") if folder.is_dir() and not inside.is_file() else ()
-    stages = [stage for stage in named if stage.name != "edits.usda"]  # of a robot's user
+    stages = [s for s in folder.glob("*.usda") if s.name != "edits.usda"] if folder.is_dir() else []
     whole = [stage for stage in stages if stage.with_name(f"{stage.stem}_layer.usda").is_file()]
     whole = whole or [stage for stage in stages if b"@./magnetics" in _head(stage)] or stages
-    return whole[0] if len(whole) == 1 else inside
+    return whole[0] if len(whole) == 1 and inside not in whole else inside
 
 
 def shipped_or(file: str | Path) -> Path:
