@@ -247,8 +247,8 @@ class Descent:
         rmse = float(np.sqrt(np.mean(error**2)))
         if not math.isfinite(squares + rmse):
             raise InputError(
-                f"training diverged in epoch {number}; give a step size lr below {self.lr:g}, or look for a nan "
-                "in what the model makes of some inputs",
+                f"training diverged in epoch {number}; give a step size lr below {self.lr:g}, or look for a "
+                "nan in what the model makes of some inputs",
                 parameter="lr",
             )
         better = rmse < min((epoch.val_rmse_nt for epoch in self.history), default=math.inf)
