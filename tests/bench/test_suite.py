@@ -96,7 +96,7 @@ def test_a_wrong_suite_is_refused(write, old, new, text):
     ("old", "new", "text"),
     [
         ('method = "rbpf"', 'method = "rbfp"', "no localizer 'rbfp'; did you mean 'rbpf'"),
-        ("runs = 3", 'runs = 3\npaths = ["sine", "figur8"]', "'figur8'; did you mean 'figure8'"),
+        ("runs = 3", 'runs = 3\npaths = ["sine", "figur8"]', r"'figur8' \(did you mean 'figure8'"),
         ("particles = 200", "partikles = 200", "'rbpf' has no option 'partikles'; did you mean 'particles'"),
         ('method = "rbpf"', 'method = "no_such_module:Filter"', "cannot be imported: ModuleNotFoundError"),
         ('method = "rbpf"', 'method = "math:tau"', "cannot be made|must have the methods"),

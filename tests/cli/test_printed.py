@@ -134,7 +134,7 @@ def test_a_command_prints_few_lines_and_typed_again_it_writes_beside_and_says_so
 @pytest.mark.parametrize(
     ("words", "status", "error"),
     [
-        ("info no.usda", 1, {"message": "no.usda: no such file", "file": "no.usda"}),
+        ("info no.usda", 1, {"hint": "magtwin run lab makes run/run.parquet, and lab is a stage"}),
         ("run lab --path no", 1, {"hint": "give a name, or a CSV file with x,y in metres"}),
         ("run lab --duration-s x", 2, {"parameter": "--duration-s"}),
         ("new x.txt", 1, {"file": "x.txt"}),
