@@ -85,7 +85,9 @@ def run_chunk(
                 seed = case.problem.seed
                 if foreign(entry.method) or scenario.source == "drawn":
                     salt = bytes.fromhex(suite.salt)
-                    seed = seed_of(suite.sha256, scenario.name, suite.first_seed + run, name, salt)
+                    seed = seed_of(
+                        f"{suite.name} {suite.version}", scenario.name, suite.first_seed + run, name, salt
+                    )
                 found, scores, smooth = run_localizer(entry, case, suite.time_limit_s, limits, scenario, seed)
             row = scores.row()
             made[TIMES].append({**key, "step_us": row.pop("step_us")})

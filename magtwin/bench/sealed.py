@@ -61,7 +61,7 @@ def seed_of(suite: str, scenario: str, run: int, localizer: str, salt: bytes = b
     """Seed of a localizer that tells nothing of the seed of the case, below 2^63.
 
     Args:
-        suite: Checksum of the suite.
+        suite: Name and version of the suite, which are those of all of its parts.
         scenario: Name of the scenario.
         run: Seed of the run.
         localizer: Name of the localizer.
