@@ -509,13 +509,10 @@ class Room(Summarized):
         from_values(cls, values, f"{section} {values['name']!r}")
         return self._adding(section, values)
 
-    def _check_standing(self) -> None:
-        """Refuse walls that cannot stand, and furniture in them."""
+    def _check_standing(self, tables: Sequence[Mapping[str, Any]]) -> None:
+        """Refuse walls that cannot stand, and pieces of furniture in them."""
         lab, seed = self._lab(), self.table["seed"]
-        pieces = [
-            from_values(FurnitureTable, each, each["name"]).spec(seed)
-            for each in self.table.get("furniture", ())
-        ]
+        pieces = [from_values(FurnitureTable, each, each["name"]).spec(seed) for each in tables]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MismatchWarning)  # of a scene, and told when it is made
             where = f"room {self.table['name']!r}"
@@ -534,8 +531,10 @@ class Room(Summarized):
                 f"two things of [[{section}]] are called {values['name']!r}; give each its own name"
             )
         room = self._with(**{section: [*held, plain(values)]})
-        if section in ("wall", "door", "window", "furniture"):
-            room._check_standing()
+        if section == "furniture":
+            room._check_standing(room.table[section][-1:])
+        elif section in ("wall", "door", "window"):
+            room._check_standing(room.table.get("furniture", ()))
         return room
 
     def _with(self, **tables: Any) -> "Room":

@@ -196,8 +196,9 @@ class Contestant:
         if not pid:
             return ""
         for _ in range(100):  # its line closes a moment before it ends
-            if _state(pid) != "Z":
-                time.sleep(0.001)
+            if _state(pid) == "Z":
+                break
+            time.sleep(0.001)
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
         code = os.waitstatus_to_exitcode(self._nursery.ended(pid))

@@ -195,7 +195,8 @@ def stage_in(folder: Path) -> Path:
     inside = folder / f"{folder.resolve().name}.usda"
     stages = [s for s in folder.glob("*.usda") if s.name != "edits.usda"] if folder.is_dir() else []
     whole = [stage for stage in stages if stage.with_name(f"{stage.stem}_layer.usda").is_file()]
-    whole = whole or [stage for stage in stages if b"@./magnetics" in _head(stage)] or stages
+    whole = whole or [stage for stage in stages if b"@./magnetics" in _head(stage)]
+    whole = whole or (stages if (folder / "payloads").is_dir() else [])  # of a robot
     return whole[0] if len(whole) == 1 and inside not in whole else inside
 
 

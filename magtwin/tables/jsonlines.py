@@ -1,6 +1,7 @@
 """JSON lines: an object a line, whose keys are the columns of a table."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,8 @@ MOST_KEYS = 1_000  # Most columns
 
 def is_json_lines(content: bytes) -> bool:
     """Whether the first line of a text is an object of JSON."""
-    line = content[:4096].lstrip(b"\xef\xbb\xbf \t\r\n").split(b"\n")[0].strip()
-    return line.startswith(b'{"') and line.endswith(b"}")
+    line = content.lstrip(b"\xef\xbb\xbf \t\r\n").partition(b"\n")[0].strip()
+    return re.match(rb'\{\s*"', line) is not None and line.endswith(b"}")
 
 
 def rows_of_json(path: Path, content: bytes) -> tuple[dict[str, list[str]], list[int]]:
@@ -22,12 +23,12 @@ def rows_of_json(path: Path, content: bytes) -> tuple[dict[str, list[str]], list
     Keys of an object within an object follow its own, with a point between; parts of a list have numbers.
     """
     rows, lines = list[dict[str, str]](), list[int]()
-    text = content.decode("utf-8-sig", "replace").splitlines()
+    text = content.decode("utf-8-sig", "replace").rstrip("\n").split("\n")
     for number, line in enumerate(text, 1):
         try:
             value = json.loads(line) if line.strip() else None
-        except ValueError:
-            if number == len(text):
+        except (ValueError, RecursionError):
+            if number == len(text) and rows:
                 break  # the last line was cut short
             raise InputError(f"{path}:{number}: no object of JSON: {line[:QUOTED]!r}") from None
         if isinstance(value, dict):

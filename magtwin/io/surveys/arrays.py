@@ -44,10 +44,12 @@ def tables_of_arrays(path: Path) -> dict[str, Table]:
             values = values if values.shape[0] > values.shape[1] else values.T
         group, _, last = name.rpartition(".")
         if len(values) >= LEAST_ROWS and (values.ndim == 1 or values.shape[1] <= MOST_PARTS):
-            labels = _labels(group, last, values.reshape(len(values), -1).shape[1])
+            parts = values.reshape(len(values), -1).T
+            labels = [f"{label} [{unit}]" if unit else label for label in _labels(group, last, len(parts))]
             some = groups.setdefault((group, len(values)), {})
-            for label, part in zip(labels, values.reshape(len(values), -1).T, strict=True):
-                some[f"{label} [{unit}]" if unit else label] = part
+            if some.keys() & set(labels):  # another array of this kind, such as mag and mag_raw
+                labels = [f"{last} {label}" for label in labels]
+            some |= zip(labels, parts, strict=True)
     timed = {key for key, some in groups.items() if any(meaning_of(label, "t") for label in some)}
     for key in [key for key in groups if key not in timed]:
         same = [other for other in groups if other[1] == key[1]]

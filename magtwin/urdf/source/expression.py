@@ -94,7 +94,7 @@ def _operation(name: str) -> Callable[[_Set, Any], Any]:
     return apply
 
 
-for _name in ("and", "or", "sub", "xor", "eq", "le", "lt", "ge", "gt"):
+for _name in ("and", "or", "sub", "xor", "eq", "ne", "le", "lt", "ge", "gt"):
     setattr(_Set, f"__{_name}__", _operation(f"__{_name}__"))
 
 
