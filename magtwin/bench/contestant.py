@@ -9,7 +9,6 @@ or this program ends with it.
 """
 
 import contextlib
-import ctypes
 import gc
 import importlib
 import json
@@ -17,7 +16,6 @@ import mmap
 import os
 import pickle
 import random
-import signal
 import socket
 import struct
 import sys
@@ -35,7 +33,7 @@ from magtwin.localization.problem import Estimate, Localizer, Problem, Smoother
 from magtwin.localization.readings import unpacked
 from magtwin.localization.track import LocalizerError, called, checked_estimates, stepped
 from magtwin.parallel import jail
-from magtwin.parallel.machine import PR_SET_PDEATHSIG
+from magtwin.parallel.machine import ends_with_parent
 
 FRAME = struct.Struct("=16d")
 """An answer: its kind, then t, x, y, yaw, covariance (3 x 3), bias and lost; or the length of a text."""
@@ -98,7 +96,8 @@ def main(control: socket.socket) -> None:
 
 
 def _contest(line: socket.socket, memory: int, ruleset: int, task: Mapping[str, Any]) -> None:
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if ask := ends_with_parent():
+        ask()
     for name in os.listdir("/proc/self/fd"):
         if int(name) not in (0, 1, 2, line.fileno(), memory, ruleset):
             with contextlib.suppress(OSError):
@@ -107,7 +106,7 @@ def _contest(line: socket.socket, memory: int, ruleset: int, task: Mapping[str, 
     random.seed(task["seed"])
     np.random.seed(task["seed"] % 2**32)  # noqa: NPY002  for localizers that draw from it
     with _said(line):
-        jail.close_in(ruleset, task["memory"])
+        jail.close_in(ruleset)
         algorithm = load_localizer(task["method"], task["options"])
         name = type(algorithm).__name__
         causal = isinstance(algorithm, Localizer)

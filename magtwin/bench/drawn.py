@@ -75,7 +75,6 @@ PLACES = (
 class Place:
     """A place: its field, and where a robot can be."""
 
-    name: str
     field: AnomalyMap
     clear_m: Array
     """Distance of each node of the field from what stands there, and from the walls [m], shape (Y, X)."""
@@ -160,7 +159,7 @@ def place(number: int, salt: str) -> Place:
     free = np.pad(~solid, 1)  # with walls
     clear = np.asarray(distance_transform_edt(free))[1:-1, 1:-1] * kind.cell
     length = math.sqrt(2) * total.std() / math.sqrt(np.mean(slope[0] ** 2 + slope[1] ** 2))
-    return Place(kind.name, made, clear, float(length), kind)
+    return Place(made, clear, float(length), kind)
 
 
 def _field(sheets: tuple[Array, ...], heights_m: tuple[float, ...], cell_m: float) -> Array:
@@ -189,14 +188,12 @@ def drive(place: Place, duration_s: float, rate_hz: float, rng: np.random.Genera
     speed = rng.uniform(*place.kind.speed) * (1 + 0.2 * np.sin(rng.uniform(0, 6) + np.arange(256) / 20))
     cell, window = place.kind.cell, max(4 * RADIUS_M, 2.5 * float(speed.max()))
     needed_m = duration_s * speed.max() + 2 * window
-    margin = RADIUS_M + window / 8  # a mean over the window cuts a corner by less
-    ys, xs = np.nonzero(place.clear_m >= min(margin, 0.7 * place.clear_m.max()))
-    margin = min(margin, 0.7 * place.clear_m.max())
+    margin = min(RADIUS_M + window / 8, 0.7 * float(place.clear_m.max()))  # the mean cuts a corner by less
+    ys, xs = np.nonzero(place.clear_m >= margin)
     spots = np.column_stack([xs, ys]) * cell
     if len(spots) < 2:
-        raise InputError(f"{place.name}: no room for a robot of radius {RADIUS_M:g} m")
-    path, length = [spots[rng.integers(len(spots))]], 0.0
-    ends = 0
+        raise InputError(f"{place.kind.name}: no room for a robot of radius {RADIUS_M:g} m")
+    path, length, ends = [spots[rng.integers(len(spots))]], 0.0, 0
     far = 0.25 * float(np.ptp(spots, axis=0).max())
     while length < needed_m:
         tried = spots[rng.integers(len(spots), size=TRIES)] - path[-1]
@@ -212,7 +209,9 @@ def drive(place: Place, duration_s: float, rate_hz: float, rng: np.random.Genera
             path, length = [spots[rng.integers(len(spots))]], 0.0
             ends += 1
             if ends > TRIES:
-                raise InputError(f"{place.name}: no path of {needed_m:.0f} m for a robot of {RADIUS_M:g} m")
+                raise InputError(
+                    f"{place.kind.name}: no path of {needed_m:.0f} m for a robot of {RADIUS_M:g} m"
+                )
             continue
         path.append(spot)
         length += step

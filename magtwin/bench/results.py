@@ -68,15 +68,12 @@ class Results(Summarized):
     @property
     def missing(self) -> int:
         """Runs of the suite's localizers that the rows lack."""
-        pairs = {(s.name, n): s.runs for s in self.suite.scenario for n in self.suite.entries_of(s)}
-        names, counts = self.suite.localizers, dict.fromkeys(pairs, 0)
+        scenario, localizer, run = (self.rows[name] for name in ("scenario", "localizer", "run"))
+        left = 0
         for s in self.suite.scenario:
-            here = self.rows["scenario"] == s.name
-            for name in names:
-                if (s.name, name) in counts:
-                    mine = self.rows["run"][here & (self.rows["localizer"] == name)]
-                    counts[s.name, name] = int(np.count_nonzero(mine < s.runs))
-        return sum(pairs.values()) - sum(counts.values())
+            there = localizer[(scenario == s.name) & (run < s.runs)]
+            left += sum(s.runs - int((there == name).sum()) for name in self.suite.entries_of(s))
+        return left
 
     @property
     def compensated(self) -> list[str]:

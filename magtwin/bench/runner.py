@@ -146,8 +146,7 @@ def benchmark(
         InputError: The suite or an option is wrong, data are missing, `out` holds other results, or there is
             too little memory for `jobs`.
     """
-    if runs is not None and runs < 1:
-        raise InputError(f"`runs` must be at least 1, got {runs}", parameter="runs")
+    _check_runs(runs)
     file, out = suite_file(suite), Path(out)
     whole = load_suite(file)
     chosen = whole.limited(
@@ -202,6 +201,7 @@ def verify(
         InputError: It is no receipt or of another version, the rows or the suite are not those of the
             receipt, or a localizer is missing here.
     """
+    _check_runs(runs)
     told = read_receipt(receipt)
     folder = Path(receipt) if Path(receipt).is_dir() else Path(receipt).parent
     there = results.read_results(folder)
@@ -239,6 +239,11 @@ def verify(
         ),
         {"differences": dict(enumerate(wrong))} if wrong else {},
     )
+
+
+def _check_runs(runs: int | None) -> None:
+    if runs is not None and runs < 1:
+        raise InputError(f"`runs` must be at least 1, got {runs}", parameter="runs")
 
 
 def about(whole: Suite, chosen: Suite) -> dict[str, Any]:
@@ -293,7 +298,7 @@ def _run(
     tasks: Sequence[Task] = plan
     while tasks:
         again = []
-        count.tasks = tasks
+        count.start(tasks)
         for outcome in pool.run(work, tasks, limit_s=2 * suite.time_limit_s + GRACE_S, heard=count.heard):
             task = tasks[outcome.index]
             if outcome.failure is not None and outcome.failure.refused is None:
@@ -309,10 +314,13 @@ class _Count:
     """The runs that are made, those of unfinished chunks included."""
 
     def __init__(self, plan: Plan, progress: Progress) -> None:
-        self.tasks: Sequence[Task] = plan
-        self._total, self._progress = plan.size, progress
-        self._finished, self._begun = 0, dict[int, int]()
+        self._total, self._progress, self._finished = plan.size, progress, 0
+        self.start(plan)
         self._say(plan[0].chunk.scenario)
+
+    def start(self, tasks: Sequence[Task]) -> None:
+        """Chunks are handed out: at first all of them, then those that failed."""
+        self.tasks, self._begun = tasks, dict[int, int]()
 
     def heard(self, index: int, at: str) -> None:
         """A worker begins with a run."""

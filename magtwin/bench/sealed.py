@@ -104,10 +104,8 @@ class Contestant:
         here = str(Path.cwd())  # where `load_localizer` looks last
         path = tuple(sys.path) if here in sys.path else (*sys.path, here)
         self._nursery = _nursery(path, here, tuple(modules))
-        self._pid = self._nursery.fork(
-            {**task, "layout": self._rows[0], "memory": jail.MEMORY_BYTES}, theirs.fileno(), memory
-        )
-        theirs.close()
+        with theirs:
+            self._pid = self._nursery.fork({**task, "layout": self._rows[0]}, theirs.fileno(), memory)
         self.clock = (~self._pid << 3) | 2  # CLOCK_PROCESSCPUTIME of that process
 
     def load(self) -> Self:
@@ -124,7 +122,7 @@ class Contestant:
     def run(self, problem: Problem, readings: Run) -> Sequence[Estimate]:
         """Estimates at all readings, of which a localizer has got only those before and at its time."""
         rows = self._rows[1]
-        made = np.empty((len(rows), 16))
+        made = np.zeros((len(rows), 16))
         begin = time.clock_gettime(self.clock)
         if self.smooths:
             data = pickle.dumps(onboard(readings), pickle.HIGHEST_PROTOCOL)
@@ -213,7 +211,8 @@ class Contestant:
         if pid:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-            self._nursery.ended(pid)
+            with contextlib.suppress(OSError, ValueError):  # the program has ended
+                self._nursery.ended(pid)
 
 
 def _state(pid: int) -> str:
@@ -249,13 +248,19 @@ class _Nursery:
 
     def fork(self, task: Any, line: int, memory: int) -> int:
         """Start a contestant; its process."""
-        socket.send_fds(self._control, [json.dumps(task).encode()], [line, memory])
-        return int(self._control.recv(32))
+        return self._ask(task, [line, memory])
 
     def ended(self, pid: int) -> int:
         """Status of a contestant that has ended."""
-        self._control.send(json.dumps({"ended": pid}).encode())
-        return int(self._control.recv(32))
+        return self._ask({"ended": pid}, [])
+
+    def _ask(self, order: Any, files: list[int]) -> int:
+        try:
+            socket.send_fds(self._control, [json.dumps(order).encode()], files)
+            return int(self._control.recv(32))
+        except BaseException:  # as of a time limit: its answer would be taken for that to the next order
+            close()
+            raise
 
     def close(self) -> None:
         """End the program, and with it all of its contestants."""

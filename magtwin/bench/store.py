@@ -137,8 +137,9 @@ class Journal:
             merge(self._folder, self._order)
         if self._file is None:
             name = f"journal-{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}.log"
-            self._file = open(self._folder / name, "xb", 0)  # noqa: SIM115  until it is closed
-            _lock(self._file.fileno(), wait=False)
+            with alone(self._folder):  # or another program takes the new file for one that is left
+                self._file = open(self._folder / name, "xb", 0)  # noqa: SIM115  until it is closed
+                _lock(self._file.fileno(), wait=False)
         frames = b""
         for number, kind in enumerate(SCHEMAS):
             if tables.get(kind):

@@ -342,7 +342,7 @@ class Suite:
             scenario=tuple(kept),
             localizer=tuple(entries),
             seeds=seeds,
-            salt=salt,
+            salt=bytes.fromhex(salt).hex(),
             data={**self.data, **(data or {})},
         )
 

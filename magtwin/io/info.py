@@ -41,8 +41,9 @@ def info_of(
         from magtwin.io.surveys.doctor import info_of_survey
 
         return info_of_survey(file, told, waypoints, step_m)
-    if waypoints is not None or replace(told, unit=None, scale=None) != Columns():
-        raise InputError(f"{file}: no table of readings; drop --waypoints and the options that name columns")
+    if waypoints is not None or step_m is not None or replace(told, unit=None, scale=None) != Columns():
+        text = "no table of readings; drop --waypoints, --step-m and the options that name columns"
+        raise InputError(f"{file}: {text}")
     if is_bag(file):
         from magtwin.io.recording.contents import info_of_bag
 

@@ -118,12 +118,11 @@ def _is_code(path: Path) -> bool:
     return path.suffix in (".py", ".so", ".pyc")
 
 
-def close_in(ruleset: int, memory_bytes: int = MEMORY_BYTES) -> None:
+def close_in(ruleset: int) -> None:
     """Jail this process for good; it must have no other thread.
 
     Args:
         ruleset: What `readable` gave; it is closed.
-        memory_bytes: Memory that the process can take beyond what it has.
 
     Raises:
         JailError: The system did not take it. Then do not run foreign code.
@@ -131,7 +130,7 @@ def close_in(ruleset: int, memory_bytes: int = MEMORY_BYTES) -> None:
     import resource
 
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    most = pages * resource.getpagesize() + memory_bytes
+    most = pages * resource.getpagesize() + MEMORY_BYTES
     for kind, limit in ((resource.RLIMIT_AS, most), (resource.RLIMIT_CORE, 0)):
         resource.setrlimit(kind, (limit, limit))
     libc = ctypes.CDLL(None, use_errno=True)

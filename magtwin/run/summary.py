@@ -69,8 +69,8 @@ def swept(metadata: Mapping[str, Any]) -> str:
     if "path_placing" not in metadata:
         return f"{share:.1%} of the floor that the robot can reach is within 0.25 m of the path"
     return (
-        f"{1 - share:.0%} of the free floor is outside of the path, which was scaled to fit; "
-        'path "coverage" drives all that can be reached'
+        f"{1 - share:.0%} of the free floor is outside of the path, which was scaled to fit, or behind "
+        'closed doors; path "coverage" drives all that can be reached'
     )
 
 

@@ -77,6 +77,14 @@ def test_a_sample_is_made_again_and_a_changed_row_is_found(made):
         (made / "receipt.json").write_bytes(receipt)
 
 
+def test_a_part_of_a_suite_with_a_localizer_that_draws_is_made_again_alike(tmp_path):
+    (tmp_path / "own.toml").write_text(SUITE)
+    benchmark(tmp_path / "own.toml", tmp_path / "part", runs=2, localizers=["rbpf"], jobs=1)
+    report = verify(tmp_path / "part", runs=2, jobs=1)
+    figures = {figure.name: figure.value for figure in report.figures}
+    assert (figures["made again"], figures["different"]) == (2, 0)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

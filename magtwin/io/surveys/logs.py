@@ -76,6 +76,9 @@ def table_of_log(path: Path, waypoints: Path | None = None, step_m: float | None
         raise InputError(f"{waypoints}: no marks; {text}")
     if marks:
         return walked(field, marks, _accelerations(parts), step_m)
+    if step_m is not None:
+        text = "its positions do not come from marks of a walk; leave out --step-m"
+        raise InputError(f"{path}: {text}", parameter="step_m")
     if labels := field.find("x", "y") or field.find("lon", "lat"):
         return _filled(field, [*labels, *field.find("heading")])
     for other in (part for key, part in parts.items() if key != name):

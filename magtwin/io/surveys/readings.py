@@ -179,8 +179,9 @@ def _part(
         for other in paths[1:]:
             table = table.beside(read_table(other))
         return rows_of_table(table, columns, path.stem, "; ".join(map(_sum, paths)))[0]
-    if waypoints is not None:
-        raise InputError(f"{path}: its positions are known; leave out --waypoints", parameter="waypoints")
+    if waypoints is not None or step_m is not None:
+        text = "its positions are known; leave out --waypoints and --step-m"
+        raise InputError(f"{path}: {text}", parameter="waypoints")
     if replace(columns, unit=None, scale=None) != Columns():
         raise InputError(f"{path}: its columns are known; drop the options that name columns")
     if kind is SURVEY:

@@ -211,6 +211,8 @@ class TollesLawson:
         PX4 subtracts CAL_MAG0_OFF [G] and adds CAL_MAG0_COMP per kA; ArduPilot adds COMPASS_OFS [mG] and
         COMPASS_MOT per A. Coefficients that the run does not determine are left out.
         """
+        if not self.sd:
+            raise InputError("the model has no intervals of its coefficients; fit it again")
         px4, made = kind == "px4", {}
         for name, value, sd in zip(self.columns, self.coefficients, self.sd, strict=True):
             term, _, axis = name.partition(" ")
