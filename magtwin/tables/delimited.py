@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from magtwin.errors import InputError
-from magtwin.files.file import existing_file
 from magtwin.tables.body import body_of, cells, degrees_of
 from magtwin.tables.labels import meaning_of, split_label
 from magtwin.tables.quantities import UNITS
@@ -91,10 +90,8 @@ class Delimited:
     comments: tuple[tuple[int, str], ...] = ()  # Number and text of the lines that begin with `#`
 
 
-def read_delimited(
-    path: str | os.PathLike[str], noun: str, wanted: str, content: bytes | None = None
-) -> Delimited:
-    """Read a text file of rows whose words are separated by commas, semicolons, tabs or blanks.
+def read_delimited(path: str | os.PathLike[str], noun: str, wanted: str, content: bytes) -> Delimited:
+    """Read the text of a file of rows whose words are separated by commas, semicolons, tabs or blanks.
 
     The text is UTF-8, UTF-16, or cp1252, which older spreadsheets write. The header is the first line if any
     of its words is not a number, else the last comment line above the rows with as many words as they have.
@@ -107,10 +104,8 @@ def read_delimited(
     missing if it is far below all others of its column.
 
     Errors tell its `noun` and what a row holds, which is `wanted` ("one row of numbers per reading").
-    `content` are the bytes of a file that lies in an archive.
+    `content` are the bytes of the file.
     """
-    if content is None:
-        content = existing_file(path, noun, "readings").read_bytes()
     path, notes = Path(path), list[str]()
     lines, ended = _lines(path, _decoded(path, content, noun, notes))
     comments, above, lines, told = _without_comments(lines, notes)

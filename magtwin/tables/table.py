@@ -291,10 +291,8 @@ def _seconds(texts: Sequence[str], read: Callable[[str], datetime]) -> list[floa
     return seconds
 
 
-def _lattice_or_json(path: Path, noun: str, content: bytes | None) -> Table | None:
+def _lattice_or_json(path: Path, content: bytes) -> Table | None:
     """The table of a grid or of lines of JSON; None for other texts."""
-    if content is None:
-        content = existing_file(path, noun, "readings").read_bytes()
     if is_lattice(content):
         columns, note = nodes_of(path, content)
         return Table(tuple(Column(name, cells, path, None) for name, cells in columns.items()), (note,))
@@ -326,8 +324,10 @@ def read_table(
         from magtwin.tables.spreadsheet import text_of_spreadsheet
 
         content = text_of_spreadsheet(existing(path, noun))
-    if (special := _lattice_or_json(Path(path), noun, content)) is not None:
-        return special
+    elif content is None:
+        content = existing_file(path, noun, "readings").read_bytes()
+    if (special := _lattice_or_json(Path(path), content)) is not None:
+        return _by_time(special)
     text = read_delimited(path, noun, wanted, content)
     names = text.names or ("",) * len(text.rows[0])
     pairs = zip(names, zip(*text.rows, strict=True), strict=True)
